@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+from glob import glob
+
+from setuptools import setup
+
+package = 'fam_bundle_bringup'
+
+setup(
+    name=package,
+    version='0.1.0',
+    description='Configuration and the experiment runner of a bundle.',
+    maintainer='fam_bundle maintainers',
+    maintainer_email='maintainers@fam-bundle.example',
+    license='Apache-2.0',
+    packages=[package],
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{package}']),
+        (f'share/{package}', ['package.xml']),
+        (f'share/{package}/config', sorted(glob('config/*.yaml'))),
+    ],
+    install_requires=['setuptools'],
+    extras_require={'test': ['pytest']},
+    zip_safe=False,
+    entry_points={
+        'console_scripts': [
+            'fam_bundle = fam_bundle_bringup.cli:main',
+        ],
+    },
+)
