@@ -6,7 +6,7 @@ package = 'fam_bundle_model'
 setup(
     name=package,
     version='0.1.0',
-    description='Physics of a variable-recruitment bundle of fluidic artificial muscles, without ROS.',
+    description='Physics of a variable-recruitment bundle of fluidic artificial muscles.',
     maintainer='fam_bundle maintainers',
     maintainer_email='maintainers@fam-bundle.example',
     license='Apache-2.0',
