@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compilation of plain functions of floats by numba, with a cache that cannot go stale.
+
+Every law of the project is written once, as a plain function. ``compiled`` hands it to numba;
+where numba is missing the function is interpreted, which is slower and gives the same bits.
+"""
+
+import hashlib
+import importlib.util
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+Function = TypeVar('Function', bound=Callable[..., Any])
+
+# Packages whose functions inline each other when compiled.
+COMPILED_PACKAGES = (
+    'fam_bundle_model',
+    'fam_bundle_control',
+    'fam_bundle_sim',
+    'fam_bundle_bringup',
+)
+
+
+def source_digest() -> str:
+    """Return a digest of the sources of all packages that hold compiled functions."""
+    digest = hashlib.sha256()
+    for package in COMPILED_PACKAGES:
+        spec = importlib.util.find_spec(package)
+        for folder in (spec.submodule_search_locations or ()) if spec else ():
+            for path in sorted(Path(folder).glob('*.py')):
+                digest.update(path.name.encode() + b'\0' + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def cache_directory() -> Path:
+    """Return the folder for compiled code and lag tables of this user.
+
+    ``$XDG_CACHE_HOME/fam_bundle``, or ``~/.cache/fam_bundle``.
+    """
+    return Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'fam_bundle'
+
+
+def _numba_decorator() -> Callable[[Any], Any] | None:
+    try:
+        import numba
+    except ImportError:
+        return None
+    # numba checks only the file that defines a function, not those of the functions it inlines:
+    # a cache folder of its own for each state of the sources keeps old code from being loaded.
+    if 'NUMBA_CACHE_DIR' not in os.environ:
+        numba.config.CACHE_DIR = str(cache_directory() / f'compiled-{source_digest()}')
+    decorator: Callable[[Any], Any] = numba.njit(cache=True, error_model='numpy')
+    return decorator
+
+
+_DECORATOR = None if os.environ.get('FAM_BUNDLE_INTERPRET') else _numba_decorator()
+
+
+def compiled(function: Function) -> Function:
+    """Compile ``function`` with numba (IEEE arithmetic, no fast math), or return it as it is.
+
+    ``FAM_BUNDLE_INTERPRET=1`` in the environment leaves every function interpreted.
+    """
+    return function if _DECORATOR is None else _DECORATOR(function)  # type: ignore[no-any-return]

@@ -1,0 +1,350 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every parameter of the system, declared once (see ``schema.py``), and its YAML file.
+
+The file is a ROS 2 parameter file, so that one file serves the experiment runner, the offline
+loop and single nodes (``--ros-args --params-file``). SI units throughout.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fam_bundle_model.schema import (
+    ConfigurationError,
+    choice,
+    integer,
+    make_group,
+    number,
+    per_unit,
+    positive,
+    unknown,
+)
+
+SCHEMES = ('baseline', 'lag', 'pressure', 'lag_pressure')
+GRAVITY = 9.80665  # m/s^2
+
+_POSITIVE = {'minimum': 0.0, 'exclusive': True}
+
+
+@dataclass(frozen=True)
+class FamParameters:
+    """The fluidic artificial muscles, one value per motor unit (Table 1, equations 1-4)."""
+
+    count: tuple[int, ...] = per_unit(
+        int, '', 'FAMs in parallel in each motor unit, in recruitment order', minimum=1, maximum=64
+    )
+    inner_radius: tuple[float, ...] = per_unit(float, 'm', 'initial inner radius r0', **_POSITIVE)
+    thickness: tuple[float, ...] = per_unit(float, 'm', 'initial bladder wall t0', **_POSITIVE)
+    braid_angle: tuple[float, ...] = per_unit(
+        float, 'rad', 'initial braid angle a0, from the axis', minimum=0.05, maximum=0.95
+    )
+    length: tuple[float, ...] = per_unit(float, 'm', 'initial length L0', **_POSITIVE)
+    youngs_modulus: tuple[float, ...] = per_unit(
+        float, 'Pa', "bladder's Young's modulus before its correction factor", **_POSITIVE
+    )
+    youngs_modulus_factor: tuple[float, ...] = per_unit(
+        float, '', "correction factor on Young's modulus", **_POSITIVE
+    )
+    mooney_rivlin_share: tuple[float, ...] = per_unit(
+        float, '', 'C2 / (C1 + C2) of the bladder; 0 is neo-Hookean', minimum=0.0, maximum=1.0
+    )
+    poisson_ratio: tuple[float, ...] = per_unit(
+        float, '', "bladder's Poisson ratio in the Brazier moment", minimum=0.0, maximum=0.5
+    )
+    collapse_moment_factor: tuple[float, ...] = per_unit(
+        float, '', 'correction factor on the collapse moment', **_POSITIVE
+    )
+    end_spring_span: tuple[float, ...] = per_unit(
+        float, '', 'base end spring is E I / (span x outer radius)', **_POSITIVE
+    )
+    end_spring_slope: tuple[float, ...] = per_unit(
+        float, '1/Pa', 'growth of the end spring factor with pressure', minimum=0.0
+    )
+    end_spring_offset: tuple[float, ...] = per_unit(
+        float, '', 'end spring factor at zero pressure', **_POSITIVE
+    )
+    transition_constant: tuple[float, ...] = per_unit(
+        float, '', 'decay beta from buckled to collapsed per unit strain', **_POSITIVE
+    )
+
+
+@dataclass(frozen=True)
+class SourceParameters:
+    """The pressure reducing/relief valve that feeds the servo valves (Figure 10)."""
+
+    nominal_pressure: float = positive('Pa', 'set value of the source pressure')
+    droop: float = number('Pa s/m^3', 'loss of source pressure per flow', minimum=0.0)
+    time_constant: float = positive('s', 'first-order lag of the source pressure')
+
+
+@dataclass(frozen=True)
+class ValveParameters:
+    """One servo valve per motor unit (equation 5)."""
+
+    rated_flow: float = positive('m^3/s', 'flow of the open valve at the rated pressure drop')
+    rated_pressure_drop: float = positive('Pa', 'pressure drop over one land at rated flow')
+    spool_time_constant: float = positive('s', 'first-order lag of the spool')
+
+
+@dataclass(frozen=True)
+class HoseParameters:
+    """The hose from each servo valve to its motor unit (equation 6)."""
+
+    radius: float = positive('m', 'inner radius')
+    length: float = positive('m', 'length')
+    viscosity: float = positive('Pa s', 'dynamic viscosity in the hose')
+
+
+@dataclass(frozen=True)
+class OilParameters:
+    """The hydraulic fluid (equation 7)."""
+
+    bulk_modulus: float = positive('Pa', 'effective bulk modulus, entrained air included')
+
+
+@dataclass(frozen=True)
+class LoadParameters:
+    """The hanging load and what damps it."""
+
+    mass: float = positive('kg', 'load mass')
+    damping: float = number('N s/m', 'viscous damping of the contraction', minimum=0.0)
+    friction_force: float = number('N', 'Coulomb friction', minimum=0.0)
+    friction_rate: float = positive('1/s', 'strain rate at which friction is fully developed')
+
+
+@dataclass(frozen=True)
+class StrainLoopParameters:
+    """Outer PI on strain; its output is the pressure reference (Figure 3a)."""
+
+    proportional_gain: float = number('Pa', 'pressure per unit strain error', minimum=0.0)
+    integral_gain: float = number('Pa/s', 'pressure rate per unit strain error', minimum=0.0)
+    tracking_time: float = positive('s', 'time constant of the back-calculation anti-windup')
+
+
+@dataclass(frozen=True)
+class PressureLoopParameters:
+    """Inner PI of each motor unit; its output is the spool command (Figure 3b, c)."""
+
+    proportional_gain: float = number('1/Pa', 'spool per pressure error', minimum=0.0)
+    integral_gain: float = number('1/(Pa s)', 'spool rate per pressure error', minimum=0.0)
+    integral_limit: float = number('', 'largest integral share', minimum=0.0, maximum=1.0)
+
+
+@dataclass(frozen=True)
+class RecruitmentParameters:
+    """When to shift (Figures 4 and 8) and what to add meanwhile (equations 9-11)."""
+
+    scheme: str = choice('what decides a shift, and what is compensated', SCHEMES)
+    upshift_threshold: float = number(
+        '', 'share of the nominal pressure that shifts up', minimum=0.05, maximum=1.0
+    )
+    downshift_threshold: float = number(
+        '', 'share of the nominal pressure that shifts down', minimum=0.0, maximum=0.95
+    )
+    strain_rate_time_constant: float = positive('s', 'filter of the strain rate')
+    force_time_constant: float = positive('s', 'filter of the measured force')
+    minimum_strain_rate: float = positive('1/s', 'slower is taken as standing still')
+    pressure_reserve: float = number(
+        'Pa', 'kept free below the source pressure at a downshift', minimum=0.0
+    )
+    minimum_dwell: float = number('s', 'least time in a state before a downshift', minimum=0.0)
+
+
+@dataclass(frozen=True)
+class SensorParameters:
+    """Noise (standard deviation) and resolution of the simulated sensors; 0 is ideal."""
+
+    strain_noise: float = number('', 'strain', default=0.0, minimum=0.0)
+    force_noise: float = number('N', 'force', default=0.0, minimum=0.0)
+    pressure_noise: float = number('Pa', 'all pressures', default=0.0, minimum=0.0)
+    flow_noise: float = number('m^3/s', 'source flow', default=0.0, minimum=0.0)
+    strain_resolution: float = number('', 'strain', default=0.0, minimum=0.0)
+    force_resolution: float = number('N', 'force', default=0.0, minimum=0.0)
+    pressure_resolution: float = number('Pa', 'all pressures', default=0.0, minimum=0.0)
+    flow_resolution: float = number('m^3/s', 'source flow', default=0.0, minimum=0.0)
+    seed: int = integer('seed of the noise', 0, 2**31 - 1, default=0)
+
+
+@dataclass(frozen=True)
+class SimulationParameters:
+    """How the plant is integrated and where it starts."""
+
+    period: float = number('s', 'time between two ticks', minimum=1e-4, maximum=0.1)
+    substeps: int = integer('integration steps per tick', 1, 1000)
+    initial_strain: float = number(
+        '', 'strain at rest before tick 0', default=0.0, minimum=-0.1, maximum=0.25
+    )
+
+
+@dataclass(frozen=True)
+class LagTableParameters:
+    """The grid of the lag table (Figure 6)."""
+
+    source_points: int = integer('grid points of source pressure', 2, 400)
+    deslack_points: int = integer('grid points of de-slack pressure', 2, 400)
+    minimum_source: float = number(
+        '', 'lowest source pressure over the nominal one', minimum=0.05, maximum=0.99
+    )
+    maximum_lag: float = positive('s', 'a lag beyond this counts as never')
+
+
+@dataclass(frozen=True)
+class ReferenceParameters:
+    """The strain to be tracked: amplitude x (1 - cos(2 pi frequency t))."""
+
+    kind: str = choice('waveform', ('sine',))
+    amplitude: float = number('', 'half of the peak strain', minimum=0.0, maximum=0.15)
+    frequency: float = number('Hz', 'cycles per second', minimum=1e-3, maximum=10.0)
+    cycles: int = integer('cycles in a run', 1, 100_000)
+
+
+@dataclass(frozen=True)
+class RunParameters:
+    """How the graph is run; nothing here changes a result."""
+
+    pace: str = choice('what paces the plant simulator', ('lockstep',), default='lockstep')
+    listeners: int = integer(
+        'subscriptions of bundle_state to wait for before tick 0', 1, 100, default=3
+    )
+    answer_timeout: float = positive(
+        's', 'wall time without the answer to a tick that ends a lock-step run', default=20.0
+    )
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """One bundle, its rig, its controllers and its reference."""
+
+    fam: FamParameters
+    source: SourceParameters
+    valve: ValveParameters
+    hose: HoseParameters
+    oil: OilParameters
+    load: LoadParameters
+    strain_loop: StrainLoopParameters
+    pressure_loop: PressureLoopParameters
+    recruitment: RecruitmentParameters
+    sensors: SensorParameters
+    simulation: SimulationParameters
+    lag_table: LagTableParameters
+    reference: ReferenceParameters
+    run: RunParameters
+
+    def duration(self) -> float:
+        """Return the length of the run in s."""
+        return self.reference.cycles / self.reference.frequency
+
+    def period_ns(self) -> int:
+        """Return the time between two ticks in ns: stamps count in whole nanoseconds."""
+        return round(self.simulation.period * 1e9)
+
+    def ticks(self) -> int:
+        """Return the number of ticks of the run."""
+        return round(self.duration() / self.simulation.period)
+
+    def hash(self, *groups: str) -> str:
+        """Return a SHA-256 over the values of the named groups, or of all that shape a result."""
+        names = groups or [name for name in GROUPS if name != 'run']
+        chosen = {name: dataclasses.asdict(getattr(self, name)) for name in names}
+        return hashlib.sha256(json.dumps(chosen, sort_keys=True).encode()).hexdigest()
+
+
+GROUPS: dict[str, type] = {f.name: f.type for f in dataclasses.fields(Configuration)}  # type: ignore[misc]
+
+
+def make_configuration(
+    values: Mapping[str, Mapping[str, Any]], names: Iterable[str] = tuple(GROUPS)
+) -> Configuration:
+    """Return the configuration of ``values[group][parameter]``.
+
+    A node that needs only the groups ``names`` gets a configuration without the others.
+    Raises ConfigurationError naming the parameter, its value and the bound.
+    """
+    for name in values:
+        if name not in GROUPS:
+            raise ConfigurationError(unknown(name, list(GROUPS)))
+        if not isinstance(values[name], Mapping):
+            raise ConfigurationError(f'{name} = {values[name]}: must be a group of parameters')
+    groups: dict[str, Any] = dict.fromkeys(GROUPS)
+    groups |= {name: make_group(GROUPS[name], name, values.get(name, {})) for name in names}
+    configuration = Configuration(**groups)
+    if configuration.fam is not None:
+        check_fam(configuration.fam)
+    return configuration
+
+
+def check_fam(fam: FamParameters) -> None:
+    """Raise ConfigurationError unless each parameter has one value, or one per motor unit."""
+    units = len(fam.count)
+    if len(set(fam.length)) > 1:
+        raise ConfigurationError(
+            f'fam.length = {list(fam.length)} m: must be equal, for all FAMs share one strain'
+        )
+    for name, value in dataclasses.asdict(fam).items():
+        if len(value) not in (1, units):
+            raise ConfigurationError(
+                f'fam.{name}: {len(value)} values for {units} motor units; must be 1 or {units}'
+            )
+
+
+def read_yaml(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the parameters in a ROS 2 parameter file, by group.
+
+    Raises ConfigurationError when the file cannot be read or has another layout.
+    """
+    import yaml
+
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except OSError as error:
+        raise ConfigurationError(f'{path}: cannot be read ({error.strerror})') from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigurationError(f'{path}: not YAML ({" ".join(str(error).split())})') from None
+    try:
+        parameters = content['/**']['ros__parameters']
+        if not isinstance(parameters, dict):
+            raise TypeError
+    except (KeyError, TypeError):
+        raise ConfigurationError(f"{path}: must hold '/**: ros__parameters:'") from None
+    return parameters
+
+
+def load_configuration(
+    path: Path, changes: Mapping[str, Mapping[str, Any]] | None = None
+) -> Configuration:
+    """Return the configuration in ``path`` with ``changes[group][parameter]`` laid over it.
+
+    Raises ConfigurationError; where the file is to blame, its message starts with the path.
+    """
+    values = read_yaml(path)
+    try:
+        configuration = make_configuration(values)
+    except ConfigurationError as error:
+        raise ConfigurationError(f'{path}: {error}') from None
+    if not changes:
+        return configuration
+    names = [*values, *(name for name in changes if name not in values)]
+    return make_configuration(
+        {name: {**values.get(name, {}), **changes.get(name, {})} for name in names}
+    )
+
+
+def seconds(nanoseconds: int) -> float:
+    """Return a time in s; every time and ``dt`` in the loop is rounded by this one division."""
+    return nanoseconds / 1e9
+
+
+def write_yaml(configuration: Configuration, path: Path) -> None:
+    """Write ``configuration`` as a ROS 2 parameter file that reads back to the same bits."""
+    import yaml
+
+    values = {
+        group: {k: list(v) if isinstance(v, tuple) else v for k, v in content.items()}
+        for group, content in dataclasses.asdict(configuration).items()
+    }
+    text = yaml.safe_dump({'/**': {'ros__parameters': values}}, sort_keys=False)
+    Path(path).write_text(text, encoding='utf-8')

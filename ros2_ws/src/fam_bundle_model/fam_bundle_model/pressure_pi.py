@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The PI of one motor unit's pressure (Figure 3b, c): the controller's, and the lag table's.
+
+It stands in the model because the recruitment lag is the lag of valve, hose and this law together
+(Figure 6).
+"""
+
+from typing import NamedTuple
+
+from fam_bundle_model.compile import compiled
+from fam_bundle_model.parameters import PressureLoopParameters
+
+
+class PressureGains(NamedTuple):
+    """Gains in 1/Pa and 1/(Pa s), and the largest integral share of the spool command."""
+
+    proportional: float
+    integral: float
+    integral_limit: float
+
+
+def pressure_gains(parameters: PressureLoopParameters) -> PressureGains:
+    """Return the gains of ``parameters``."""
+    return PressureGains(
+        parameters.proportional_gain, parameters.integral_gain, parameters.integral_limit
+    )
+
+
+@compiled
+def clamp(value: float, low: float, high: float) -> float:
+    """Return ``value`` limited to the range from ``low`` to ``high``."""
+    return min(max(value, low), high)
+
+
+@compiled
+def pressure_pi(
+    gains: PressureGains, integral: float, reference: float, pressure: float, dt: float
+) -> tuple[float, float]:
+    """Return the next integral share and the spool command before its limit of +-1.
+
+    ``reference`` and ``pressure`` in Pa, ``dt`` in s. An error that would push a saturated spool
+    further out is not integrated.
+    """
+    error = reference - pressure
+    spool = gains.proportional * error + integral
+    if abs(spool) < 1.0 or spool * error < 0.0:
+        limit = gains.integral_limit
+        integral = clamp(integral + gains.integral * error * dt, -limit, limit)
+    return integral, spool

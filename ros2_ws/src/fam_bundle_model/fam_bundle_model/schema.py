@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a parameter is declared: type, unit, range and one sentence, stated once.
+
+A group is a frozen dataclass whose fields are made by ``number``, ``integer``, ``choice`` or
+``per_unit``. Validation, the YAML loader, ROS parameter descriptors and the reference page all
+read the same declaration.
+"""
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+Group = TypeVar('Group')
+
+
+class ConfigurationError(ValueError):
+    """A configuration that cannot be used; the message names parameter, value and bound."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Declaration:
+    """What is known of one parameter besides its value.
+
+    ``unit`` is an SI unit or empty; ``minimum`` and ``maximum`` bound the value, and
+    ``exclusive`` says that the minimum itself is not allowed. ``kind`` is ``float``, ``int`` or
+    ``str``; ``array`` marks one value per motor unit (a single value serves all of them).
+    """
+
+    kind: type
+    unit: str
+    text: str
+    minimum: float = -math.inf
+    maximum: float = math.inf
+    exclusive: bool = False
+    choices: tuple[str, ...] = ()
+    array: bool = False
+
+    def bound(self) -> str:
+        """Return the allowed range in words."""
+        if self.choices:
+            return 'must be one of ' + ', '.join(self.choices)
+        bounds = []
+        if self.minimum > -math.inf:
+            bounds.append(f'{">" if self.exclusive else ">="} {self.minimum:g}')
+        if self.maximum < math.inf:
+            bounds.append(f'<= {self.maximum:g}')
+        return 'must be ' + (' and '.join(bounds) if bounds else 'a finite number')
+
+    def convert(self, name: str, value: Any) -> Any:
+        """Return ``value`` as the declared type, or raise ConfigurationError."""
+        if not self.array:
+            return self._convert_one(name, value)
+        values = value if isinstance(value, list | tuple) else [value]
+        if len(values) == 0:
+            raise ConfigurationError(f'{name} = []: must hold a value for each motor unit')
+        names = [name] if len(values) == 1 else [f'{name}[{i}]' for i in range(len(values))]
+        return tuple(self._convert_one(n, v) for n, v in zip(names, values, strict=True))
+
+    def _convert_one(self, name: str, value: Any) -> Any:
+        unit = f' {self.unit}' if self.unit else ''
+        refused = ConfigurationError(f'{name} = {value}{unit}: {self.bound()}')
+        if self.choices:
+            if value not in self.choices:
+                raise refused
+            return value
+        try:
+            # YAML 1.1 reads 4.9e7 as text, so text that is a number counts as one.
+            number = math.nan if isinstance(value, bool) else float(value)
+        except (TypeError, ValueError):
+            raise refused from None
+        below = number <= self.minimum if self.exclusive else number < self.minimum
+        if not math.isfinite(number) or below or number > self.maximum:
+            raise refused
+        if self.kind is int and not number.is_integer():
+            raise ConfigurationError(f'{name} = {value}: must be a whole number')
+        return self.kind(number)
+
+
+def _field(declaration: Declaration, default: Any) -> Any:
+    metadata = {'declaration': declaration}
+    if default is None:
+        return dataclasses.field(metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+def number(unit: str, text: str, *, default: float | None = None, **bounds: Any) -> Any:
+    """Declare a float in ``unit``; ``bounds`` are ``minimum``, ``maximum``, ``exclusive``."""
+    return _field(Declaration(float, unit, text, **bounds), default)
+
+
+def positive(unit: str, text: str, *, default: float | None = None) -> Any:
+    """Declare a float that must be greater than zero."""
+    return number(unit, text, default=default, minimum=0.0, exclusive=True)
+
+
+def integer(text: str, minimum: int, maximum: int, *, default: int | None = None) -> Any:
+    """Declare a whole number from ``minimum`` to ``maximum``."""
+    return _field(Declaration(int, '', text, minimum, maximum), default)
+
+
+def choice(text: str, choices: tuple[str, ...], *, default: str | None = None) -> Any:
+    """Declare one word out of ``choices``."""
+    return _field(Declaration(str, '', text, choices=choices), default)
+
+
+def per_unit(kind: type, unit: str, text: str, **bounds: Any) -> Any:
+    """Declare one value for each motor unit, or a single one for all."""
+    return _field(Declaration(kind, unit, text, array=True, **bounds), None)
+
+
+def declarations(group: type) -> dict[str, Declaration]:
+    """Return the declaration of each parameter of a group, by field name."""
+    return {f.name: f.metadata['declaration'] for f in dataclasses.fields(group)}  # type: ignore[arg-type]
+
+
+def required(group: type) -> set[str]:
+    """Return the names of the parameters of a group that have no default."""
+    fields = dataclasses.fields(group)  # type: ignore[arg-type]
+    return {f.name for f in fields if f.default is dataclasses.MISSING}
+
+
+def make_group(group: type[Group], name: str, values: Mapping[str, Any]) -> Group:
+    """Return ``group`` filled with validated ``values``.
+
+    Raises ConfigurationError for an unknown or missing parameter, or a value out of its range.
+    """
+    known = declarations(group)
+    for key in values:
+        if key not in known:
+            raise ConfigurationError(unknown(f'{name}.{key}', [f'{name}.{k}' for k in known]))
+    for key in known:
+        if key in required(group) and key not in values:
+            unit = f' (unit {known[key].unit})' if known[key].unit else ''
+            raise ConfigurationError(f'{name}.{key}: missing; {known[key].bound()}{unit}')
+    converted = {k: known[k].convert(f'{name}.{k}', v) for k, v in values.items()}
+    return group(**converted)
+
+
+def unknown(name: str, known: list[str]) -> str:
+    """Return the message for a name that does not exist, with the nearest that does."""
+    near = difflib.get_close_matches(name, known, n=1)
+    return f'{name}: no such parameter' + (f'; did you mean {near[0]}?' if near else '')
