@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS node of the inner loops: three topics of one tick in, valve_command out."""
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from fam_bundle_model.pressure_pi import pressure_gains
+from fam_bundle_msgs.msg import BundleState, PressureReference, RecruitmentState, ValveCommand
+from fam_bundle_node.loop_node import LoopNode, run_node
+from fam_bundle_node.stamps import StampClock
+from fam_bundle_node.ticks import TickJoin, check_finite, check_length
+
+from fam_bundle_control.pressure_loop import pressure_loop_step
+
+TOPICS = ('bundle_state', 'pressure_reference', 'recruitment_state')
+
+
+class PressureController(LoopNode):
+    """Computes a tick when it holds the measurement and both references of that tick."""
+
+    def __init__(self) -> None:
+        """Listen to the references at once, to the plant when the answer will be heard."""
+        super().__init__('pressure_controller', ('fam', 'pressure_loop', 'simulation'))
+        units = len(self.configuration.fam.count)
+        self.gains = pressure_gains(self.configuration.pressure_loop)
+        self.integral = np.zeros(units)
+        self.wanted, self.spool = np.zeros(units), np.zeros(units)
+        self.saturated = np.zeros(units, dtype=np.bool_)
+        self.clock = StampClock(self.configuration.period_ns())
+        self.join = TickJoin(TOPICS)
+        self.publisher = self.loop_publisher(ValveCommand, 'valve_command')
+        self.listen(PressureReference, 'pressure_reference')
+        self.listen(RecruitmentState, 'recruitment_state')
+        self.when_matched(self.publisher, 1, lambda: self.listen(BundleState, 'bundle_state'))
+
+    def listen(self, message_type: type, topic: str) -> None:
+        """Subscribe to one of the three topics."""
+        self.loop_subscription(message_type, topic, self.collector(topic))
+
+    def collector(self, topic: str) -> Callable[[Any], None]:
+        """Return the callback that answers once all three messages of a tick are there."""
+
+        def collect(message: Any) -> None:
+            complete = self.join.add(topic, message)
+            if complete is not None:
+                self.answer(*complete)
+
+        return collect
+
+    def answer(
+        self, seen: BundleState, reference: PressureReference, recruitment: RecruitmentState
+    ) -> None:
+        """Answer one tick."""
+        check_length('bundle_state', seen.tick, seen.mu_pressure, len(self.spool))
+        check_finite('bundle_state', seen.tick, (seen.source_pressure, *seen.mu_pressure))
+        check_finite('pressure_reference', seen.tick, (reference.pressure,))
+        compensation = recruitment.pressure_compensation
+        check_finite('recruitment_state', seen.tick, (compensation,))
+        pressure_loop_step(
+            self.gains,
+            self.integral,
+            recruitment.recruited,
+            reference.pressure,
+            compensation,
+            seen.source_pressure,
+            np.array(seen.mu_pressure),
+            self.clock.since_last(seen.header.stamp),
+            self.wanted,
+            self.spool,
+            self.saturated,
+        )
+        self.publisher.publish(
+            ValveCommand(
+                header=seen.header,
+                tick=seen.tick,
+                spool=self.spool.tolist(),
+                pressure_reference=self.wanted.tolist(),
+                saturated=self.saturated.tolist(),
+            )
+        )
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run_node(PressureController))

@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When to recruit and when to release a motor unit, and what to add meanwhile.
+
+Threshold recruitment is the paper's Figure 4; anticipatory recruitment its equations 12-16 and
+Figure 8; pressure compensation its equations 9-11. The two switches are independent. All
+predictions are computed in every scheme, so that they can be seen in every trace.
+
+The paper leaves the anticipatory downshift open; ``docs/recruitment.md`` argues for ours.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fam_bundle_model import fam
+from fam_bundle_model.bundle import MotorUnit, modelled_strain
+from fam_bundle_model.compile import compiled
+from fam_bundle_model.lag_table import LagTable, look_up
+from fam_bundle_model.parameters import Configuration
+
+
+class Recruitment(NamedTuple):
+    """Settings of the recruitment law; pressures in Pa, times in s, rates in 1/s."""
+
+    lag_compensation: bool
+    pressure_compensation: bool
+    upshift_pressure: float
+    downshift_pressure: float
+    nominal_pressure: float
+    strain_rate_time_constant: float
+    force_time_constant: float
+    minimum_strain_rate: float
+    pressure_reserve: float
+    minimum_dwell: float
+
+
+class RecruitmentState(NamedTuple):
+    """What the law remembers: units recruited, filters, time in the state, downshift armed."""
+
+    recruited: int
+    strain: float
+    strain_rate: float
+    force: float
+    dwell: float
+    armed: bool
+    started: bool
+
+
+class RecruitmentOutput(NamedTuple):
+    """What the law decided and what it predicted; infinite times do not apply."""
+
+    recruited: int
+    strain_rate: float
+    deslack_pressure: float
+    recruitment_lag: float
+    source_pressure_drop: float
+    time_to_saturation: float
+    time_to_desaturation: float
+    pressure_compensation: float
+    lag_outside_table: bool
+
+
+def recruitment(configuration: Configuration) -> Recruitment:
+    """Return the law of ``configuration``."""
+    p, nominal = configuration.recruitment, configuration.source.nominal_pressure
+    return Recruitment(
+        lag_compensation=p.scheme in ('lag', 'lag_pressure'),
+        pressure_compensation=p.scheme in ('pressure', 'lag_pressure'),
+        upshift_pressure=p.upshift_threshold * nominal,
+        downshift_pressure=p.downshift_threshold * nominal,
+        nominal_pressure=nominal,
+        strain_rate_time_constant=p.strain_rate_time_constant,
+        force_time_constant=p.force_time_constant,
+        minimum_strain_rate=p.minimum_strain_rate,
+        pressure_reserve=p.pressure_reserve,
+        minimum_dwell=p.minimum_dwell,
+    )
+
+
+def recruitment_start() -> RecruitmentState:
+    """Return the state before the first tick: one motor unit recruited."""
+    return RecruitmentState(1, 0.0, 0.0, 0.0, 0.0, False, False)
+
+
+@compiled
+def compensating_pressure(
+    units: tuple[MotorUnit, ...],
+    recruited: int,
+    mu_pressure: npt.NDArray[np.float64],
+    strain: float,
+) -> float:
+    """Return P_comp in Pa of equations 10 and 11 at the measured pressures and strain.
+
+    The resistance of every unit below its de-slack pressure, over the force per pressure of the
+    recruited units that are above theirs. Zero where none is slack, or none could help.
+    """
+    resistance = stiffness = 0.0
+    for i in range(len(units)):
+        unit = units[i]
+        if mu_pressure[i] < fam.deslack_pressure(unit.fam, strain):
+            pressure = max(mu_pressure[i], 0.0)
+            resistance -= unit.count * min(fam.force(unit.fam, pressure, strain), 0.0)
+        elif i < recruited:
+            stiffness += unit.count * fam.mesh_coefficient(unit.fam, strain)
+    return resistance / stiffness if stiffness > 0.0 else 0.0
+
+
+@compiled
+def time_to_reach(target: float, strain: float, rate: float) -> float:
+    """Return the time in s until the expected strain (equation 14) reaches ``target``.
+
+    Negative where it has been passed; equations 15 and 16. ``rate`` must not be zero.
+    """
+    return (target - strain) / rate
+
+
+@compiled
+def filtered(previous: float, value: float, time_constant: float, dt: float) -> float:
+    """Return the next output of a first-order low-pass filter (backward Euler)."""
+    return previous + (value - previous) * dt / (time_constant + dt)
+
+
+@compiled
+def recruitment_step(
+    law: Recruitment,
+    units: tuple[MotorUnit, ...],
+    table: LagTable,
+    state: RecruitmentState,
+    strain: float,
+    force: float,
+    source_pressure: float,
+    mu_pressure: npt.NDArray[np.float64],
+    dt: float,
+) -> tuple[RecruitmentState, RecruitmentOutput]:
+    """Return the next state and the output from one tick's measurements; SI units.
+
+    ``mu_pressure`` holds each unit's pressure in recruitment order.
+    """
+    recruited = state.recruited
+    rate, load = 0.0, force
+    if state.started:
+        rate = (strain - state.strain) / dt
+        rate = filtered(state.strain_rate, rate, law.strain_rate_time_constant, dt)
+        load = filtered(state.force, force, law.force_time_constant, dt)
+
+    next_unit = min(recruited, len(units) - 1)
+    deslack = fam.deslack_pressure(units[next_unit].fam, strain)
+    lag = look_up(table, next_unit, source_pressure, deslack)
+    compensation = compensating_pressure(units, recruited, mu_pressure, strain)
+
+    saturation = desaturation = math.inf
+    moving_up = rate > law.minimum_strain_rate
+    moving_down = rate < -law.minimum_strain_rate
+    if recruited < len(units) and moving_up:
+        margin = lag.drop + (compensation if law.pressure_compensation else 0.0)
+        limit = modelled_strain(units, recruited, source_pressure - margin, load)
+        saturation = time_to_reach(limit, strain, rate)
+    if recruited > 1 and moving_down:
+        reserved = source_pressure - law.pressure_reserve
+        limit = modelled_strain(units, recruited - 1, reserved, load)
+        desaturation = time_to_reach(limit, strain, rate)
+
+    newest = mu_pressure[recruited - 1]
+    armed = state.armed
+    if law.lag_compensation:
+        armed = armed or newest >= fam.deslack_pressure(units[recruited - 1].fam, strain)
+        # A lag of never: filling the next unit would take pressure and give nothing.
+        up = saturation <= lag.lag and lag.lag < math.inf
+        down = desaturation <= -lag.lag
+    else:
+        armed = armed or newest > law.downshift_pressure
+        up = recruited < len(units) and mu_pressure[0] >= law.upshift_pressure
+        down = newest <= law.downshift_pressure
+    dwell = state.dwell + dt
+    # A shift disturbs the very strain rate that the next decision rests on.
+    if up and dwell >= law.minimum_dwell:
+        recruited, dwell, armed = recruited + 1, 0.0, False
+    elif recruited > 1 and down and armed and dwell >= law.minimum_dwell:
+        # Below the top state the newest unit has been taut already.
+        recruited, dwell, armed = recruited - 1, 0.0, True
+    output = RecruitmentOutput(
+        recruited,
+        rate,
+        deslack,
+        lag.lag,
+        lag.drop,
+        saturation,
+        desaturation,
+        compensation if law.pressure_compensation else 0.0,
+        lag.outside,
+    )
+    return RecruitmentState(recruited, strain, rate, load, dwell, armed, True), output

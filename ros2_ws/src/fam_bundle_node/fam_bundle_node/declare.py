@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS parameters from the one schema of ``fam_bundle_model.parameters``."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from fam_bundle_model.parameters import GROUPS, Configuration, make_configuration
+from fam_bundle_model.schema import Declaration, declarations
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.node import Node
+
+
+def declare_configuration(node: Node, groups: Iterable[str]) -> Configuration:
+    """Declare the parameters of ``groups`` as ``group.name`` and return their configuration.
+
+    Raises ConfigurationError naming the parameter, its value and the bound.
+    """
+    names = tuple(groups)
+    values: dict[str, dict[str, Any]] = {}
+    for group in names:
+        given = values.setdefault(group, {})
+        for name, declaration in declarations(GROUPS[group]).items():
+            value = _declare(node, f'{group}.{name}', declaration)
+            if value is not None:
+                given[name] = value
+    return make_configuration(values, names)
+
+
+def _declare(node: Node, name: str, declaration: Declaration) -> Any:
+    unit = f' [{declaration.unit}]' if declaration.unit else ''
+    descriptor = ParameterDescriptor(
+        description=declaration.text + unit,
+        additional_constraints=declaration.bound(),
+        read_only=True,
+        # So that 525 serves where a float is wanted, and one value for all motor units.
+        dynamic_typing=True,
+    )
+    value = node.declare_parameter(name, descriptor=descriptor).value
+    return list(value) if hasattr(value, 'tolist') else value

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time steps from the stamps of messages. Pure Python."""
+
+from typing import Protocol
+
+from fam_bundle_model.parameters import seconds
+
+
+class Stamp(Protocol):
+    """A time in whole seconds and nanoseconds, as in ``builtin_interfaces/Time``."""
+
+    sec: int
+    nanosec: int
+
+
+class StampClock:
+    """Turns the stamps of successive messages into time steps."""
+
+    def __init__(self, first_step_ns: int) -> None:
+        """Take ``first_step_ns`` as the step before the first stamp."""
+        self._first_step_ns = first_step_ns
+        self._last_ns: int | None = None
+
+    def since_last(self, stamp: Stamp) -> float:
+        """Return the time in s since the stamp before."""
+        now_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+        last_ns = now_ns - self._first_step_ns if self._last_ns is None else self._last_ns
+        self._last_ns = now_ns
+        return seconds(now_ns - last_ns)
