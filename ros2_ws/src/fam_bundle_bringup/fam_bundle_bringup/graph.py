@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loop as a graph: five nodes, each its own process, over Fast DDS in lock-step."""
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from fam_bundle_io.trace import Trace
+from fam_bundle_model.parameters import Configuration, write_yaml
+
+from fam_bundle_bringup.processes import NodeDied, NodeGroup, executable
+
+if TYPE_CHECKING:
+    from fam_bundle_io.trace_recorder_node import TraceRecorder
+
+NODES = (
+    ('fam_bundle_control', 'lag_table_server'),
+    ('fam_bundle_control', 'recruitment_supervisor'),
+    ('fam_bundle_control', 'strain_controller'),
+    ('fam_bundle_control', 'pressure_controller'),
+    ('fam_bundle_sim', 'plant_simulator'),
+)
+LOOP_LISTENERS = 3  # strain controller, supervisor, pressure controller
+SLICE = 0.05  # s of listening between two looks at the processes
+DRAIN_TIMEOUT = 10.0  # s for the last messages after the plant has ended
+
+
+class GraphFailed(RuntimeError):
+    """A run that ended early; ``trace`` holds the ticks that were recorded until then."""
+
+    def __init__(self, message: str, trace: Trace) -> None:
+        """Keep the trace beside the message."""
+        super().__init__(message)
+        self.trace = trace
+
+
+class GraphResult(NamedTuple):
+    """Trace of a run, and the wall times in s of its first tick and of all ticks."""
+
+    trace: Trace
+    first_tick_seconds: float
+    run_seconds: float
+
+
+@contextlib.contextmanager
+def own_domain() -> Iterator[int]:
+    """Reserve a DDS domain that no other run on this machine uses, and stay on the machine."""
+    from domain_coordinator import domain_id
+
+    # Entered by hand: as a context it would swallow an OSError of the run.
+    reservation = domain_id()
+    number = reservation.__enter__()
+    os.environ['ROS_DOMAIN_ID'] = str(number)
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    try:
+        yield int(number)
+    finally:
+        reservation.__exit__(None, None, None)
+
+
+def start_nodes(group: NodeGroup, parameter_file: Path, listeners: int) -> None:
+    """Start the five nodes with one parameter file."""
+    for package, name in NODES:
+        command = [executable(package, name), '--ros-args', '--params-file', str(parameter_file)]
+        if name == 'plant_simulator':
+            command += ['-p', f'run.listeners:={listeners}']
+        group.start(name, command)
+
+
+def run_graph(
+    configuration: Configuration,
+    folder: Path,
+    progress: Callable[[int], None] | None = None,
+    started: Callable[[NodeGroup], None] | None = None,
+) -> GraphResult:
+    """Run ``configuration`` through the graph and return its trace.
+
+    The nodes' parameter file and what they print go to ``folder``. ``progress`` is called with
+    the ticks done so far, ``started`` with the processes once they run.
+    Raises GraphFailed when a node ends early or messages stay missing.
+    """
+    parameter_file = folder / 'parameters.yaml'
+    write_yaml(configuration, parameter_file)
+    units, ticks = len(configuration.fam.count), configuration.ticks()
+    begin, first = time.monotonic(), None
+    with own_domain(), recording() as (recorder, listen), nodes_in(folder) as group:
+        start_nodes(group, parameter_file, LOOP_LISTENERS + 1)
+        if started is not None:
+            started(group)
+        try:
+            while not group.finished('plant_simulator'):
+                listen(SLICE)
+                if first is None and recorder.ticks():
+                    first = time.monotonic()
+                if progress is not None:
+                    progress(recorder.ticks())
+            end = time.monotonic()
+            while recorder.complete_ticks() < ticks and time.monotonic() < end + DRAIN_TIMEOUT:
+                listen(SLICE)
+        except NodeDied as error:
+            raise GraphFailed(str(error), recorder.trace(units)) from None
+    trace = recorder.trace(units)
+    recorded = len(trace['time'])
+    if recorded < ticks:
+        raise GraphFailed(f'{ticks - recorded} of {ticks} ticks did not reach the trace', trace)
+    return GraphResult(trace, (first or end) - begin, end - (first or end))
+
+
+def nodes_in(folder: Path) -> NodeGroup:
+    """Return a group of nodes that print to files in ``folder``."""
+    return NodeGroup(os.environ, folder / 'log')
+
+
+@contextlib.contextmanager
+def recording() -> Iterator[tuple['TraceRecorder', Callable[[float], None]]]:
+    """Give a trace recorder in this process, and a function that listens for some seconds."""
+    import rclpy
+    from fam_bundle_io.trace_recorder_node import TraceRecorder
+    from fam_bundle_node.loop_node import make_executor
+    from rclpy.signals import SignalHandlerOptions
+    from rclpy.task import Future
+
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        recorder, never = TraceRecorder(), Future()
+        executor = make_executor()
+        executor.add_node(recorder)
+        yield recorder, lambda wait: executor.spin_until_future_complete(never, timeout_sec=wait)
+    finally:
+        rclpy.try_shutdown()

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole loop in one process, without ROS: the same laws in the same order as the graph.
+
+Its trace equals that of the graph in lock-step to the last bit; a test holds the two together.
+"""
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from fam_bundle_control.pressure_loop import pressure_loop_step
+from fam_bundle_control.recruitment import (
+    Recruitment,
+    RecruitmentState,
+    recruitment,
+    recruitment_start,
+    recruitment_step,
+)
+from fam_bundle_control.reference import strain_reference
+from fam_bundle_control.strain_loop import (
+    StrainLoop,
+    StrainLoopState,
+    strain_loop,
+    strain_loop_start,
+    strain_loop_step,
+)
+from fam_bundle_io.trace import Trace, empty_trace
+from fam_bundle_model.compile import compiled
+from fam_bundle_model.lag_table import LagTable, cached_lag_table
+from fam_bundle_model.parameters import Configuration, seconds
+from fam_bundle_model.pressure_pi import PressureGains, pressure_gains
+from fam_bundle_sim.plant import Plant, plant, plant_step, resting_state, truth
+from fam_bundle_sim.sensors import Sensors, measure, noise_samples, sensors
+
+BLOCK = 5000  # ticks between two reports of progress
+
+
+@compiled
+def run_block(
+    rig: Plant,
+    instruments: Sensors,
+    outer: StrainLoop,
+    inner: PressureGains,
+    policy: Recruitment,
+    table: LagTable,
+    period: float,
+    substeps: int,
+    plant_state: npt.NDArray[np.float64],
+    integral: npt.NDArray[np.float64],
+    outer_state: StrainLoopState,
+    policy_state: RecruitmentState,
+    references: npt.NDArray[np.float64],
+    noise: npt.NDArray[np.float64],
+    rows: npt.NDArray[np.float64],
+    mu_pressures: npt.NDArray[np.float64],
+    spools: npt.NDArray[np.float64],
+) -> tuple[StrainLoopState, RecruitmentState]:
+    """Run one tick for each of ``references`` and fill the rows of the trace.
+
+    ``plant_state`` and ``integral`` are advanced in place, the other states returned.
+    """
+    units = integral.shape[0]
+    wanted, saturated = np.empty(units), np.empty(units, dtype=np.bool_)
+    for k in range(references.shape[0]):
+        pressure, spool, row = mu_pressures[k], spools[k], rows[k]
+        seen = measure(instruments, truth(rig, plant_state, pressure), noise[k], pressure)
+        outer_state, asked = strain_loop_step(
+            outer,
+            outer_state,
+            references[k],
+            seen.strain,
+            seen.source_pressure,
+            pressure[0],
+            period,
+        )
+        policy_state, decided = recruitment_step(
+            policy,
+            rig.units,
+            table,
+            policy_state,
+            seen.strain,
+            seen.force,
+            seen.source_pressure,
+            pressure,
+            period,
+        )
+        pressure_loop_step(
+            inner,
+            integral,
+            decided.recruited,
+            asked.pressure,
+            decided.pressure_compensation,
+            seen.source_pressure,
+            pressure,
+            period,
+            wanted,
+            spool,
+            saturated,
+        )
+        row[0] = seen.strain
+        row[1] = asked.pressure
+        row[2] = seen.source_pressure
+        row[3] = decided.recruited
+        row[4] = decided.time_to_saturation
+        row[5] = decided.time_to_desaturation
+        row[6] = decided.recruitment_lag
+        row[7] = decided.pressure_compensation
+        row[8] = decided.deslack_pressure
+        row[9] = seen.force
+        row[10] = seen.source_flow
+        plant_step(rig, plant_state, spool, period, substeps)
+    return outer_state, policy_state
+
+
+# The columns of ``rows`` above, by the names of the trace.
+COLUMNS = (
+    'strain',
+    'pressure_reference',
+    'source_pressure',
+    'recruitment_state',
+    'time_to_saturation',
+    'time_to_desaturation',
+    'recruitment_lag',
+    'pressure_compensation',
+    'deslack_pressure',
+    'force',
+    'source_flow',
+)
+
+
+def run_offline(
+    configuration: Configuration,
+    progress: Callable[[int], None] | None = None,
+    table: LagTable | None = None,
+) -> Trace:
+    """Return the trace of the whole run of ``configuration``.
+
+    ``progress`` is called with the ticks done so far; ``table`` spares the look-up of the lag
+    table where the caller has it already.
+    """
+    units, ticks = len(configuration.fam.count), configuration.ticks()
+    simulation, step = configuration.simulation, configuration.period_ns()
+    rig = plant(configuration)
+    plant_state = resting_state(configuration, rig)
+    integral = np.zeros(units)
+    outer_state, policy_state = strain_loop_start(), recruitment_start()
+    samples = noise_samples(configuration.sensors, units)
+    trace = empty_trace(ticks, units)
+    laws = (
+        rig,
+        sensors(configuration.sensors, units),
+        strain_loop(configuration),
+        pressure_gains(configuration.pressure_loop),
+        recruitment(configuration),
+        cached_lag_table(configuration) if table is None else table,
+    )
+    for first in range(0, ticks, BLOCK):
+        block = slice(first, min(first + BLOCK, ticks))
+        times = [seconds(k * step) for k in range(block.start, block.stop)]
+        references = [strain_reference(configuration.reference, t) for t in times]
+        rows = np.empty((len(times), len(COLUMNS)))
+        trace['time'][block] = times
+        trace['strain_reference'][block] = references
+        outer_state, policy_state = run_block(
+            *laws,
+            seconds(step),
+            simulation.substeps,
+            plant_state,
+            integral,
+            outer_state,
+            policy_state,
+            trace['strain_reference'][block],
+            np.array(list(itertools.islice(samples, len(times)))),
+            rows,
+            trace['mu_pressure'][block],
+            trace['spool'][block],
+        )
+        for column, name in enumerate(COLUMNS):
+            trace[name][block] = rows[:, column]
+        if progress is not None:
+            progress(block.stop)
+    return trace

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nodes of a run as processes: started together, watched, and always ended."""
+
+import contextlib
+import ctypes
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+STOP_TIMEOUT = 3.0  # s that a node gets to end by itself
+
+
+class NodeDied(RuntimeError):
+    """A node ended before its time; the message names it and says how and why."""
+
+
+class NodeProcess(NamedTuple):
+    """One running node and the file that holds what it printed."""
+
+    name: str
+    process: 'subprocess.Popen[bytes]'
+    log: Path
+
+
+def _end_with_parent() -> None:
+    # Linux: a node must not outlive a runner that was killed itself.
+    set_parent_death_signal = 1
+    ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGKILL)
+
+
+class NodeGroup:
+    """Processes of one run; leaving the context ends every one of them."""
+
+    def __init__(self, environment: Mapping[str, str], logs: Path) -> None:
+        """Start nothing yet; what nodes print goes to files in ``logs``."""
+        self._environment = dict(environment)
+        self._logs = logs
+        self._nodes: list[NodeProcess] = []
+
+    def start(self, name: str, command: Sequence[str]) -> None:
+        """Start one node."""
+        self._logs.mkdir(parents=True, exist_ok=True)
+        log = self._logs / f'{name}.log'
+        with log.open('wb') as output:
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=self._environment,
+                # Ctrl-C reaches the runner alone, which ends the nodes in its own order.
+                start_new_session=True,
+                preexec_fn=_end_with_parent,
+            )
+        self._nodes.append(NodeProcess(name, process, log))
+
+    def process_ids(self) -> dict[str, int]:
+        """Return the process id of each node."""
+        return {node.name: node.process.pid for node in self._nodes}
+
+    def finished(self, name: str) -> bool:
+        """Return whether the node ``name`` has ended well.
+
+        Raises NodeDied when any node has ended otherwise.
+        """
+        done = {node.name for node in self._nodes if node.process.poll() == 0}
+        for node in self._nodes:
+            status = node.process.poll()
+            if status is not None and not (status == 0 and node.name == name):
+                raise NodeDied(f'{node.name} {_ending(status)}{_last_words(node.log)}')
+        return name in done
+
+    def __enter__(self) -> 'NodeGroup':
+        """Return the group."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End every node: first asked, then killed."""
+        for node in self._nodes:
+            with contextlib.suppress(ProcessLookupError):
+                node.process.send_signal(signal.SIGINT)
+        deadline = time.monotonic() + STOP_TIMEOUT
+        for node in self._nodes:
+            try:
+                node.process.wait(max(deadline - time.monotonic(), 0.01))
+            except subprocess.TimeoutExpired:
+                node.process.kill()
+                node.process.wait()
+
+
+def _ending(status: int) -> str:
+    if status < 0:
+        return f'was ended by signal {signal.Signals(-status).name}'
+    return f'ended with exit status {status}'
+
+
+def _last_words(log: Path) -> str:
+    """Return the last line that a node printed, after a colon, or nothing."""
+    lines = [x for x in log.read_text(errors='replace').splitlines() if x.strip()]
+    return f': {lines[-1].strip()}' if lines else ''
+
+
+def executable(package: str, name: str) -> str:
+    """Return the path of a node's executable, as ``ros2 run`` finds it."""
+    from ament_index_python.packages import get_package_prefix
+
+    return os.path.join(get_package_prefix(package), 'lib', package, name)

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The trace of a run: one array per signal, one row per tick; SI units."""
+
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+Trace = dict[str, npt.NDArray[np.generic]]
+
+SCALARS = (
+    'time',
+    'strain_reference',
+    'strain',
+    'pressure_reference',
+    'source_pressure',
+    'recruitment_state',
+    'time_to_saturation',
+    'time_to_desaturation',
+    'recruitment_lag',
+    'pressure_compensation',
+    'deslack_pressure',
+    'force',
+    'source_flow',
+)
+PER_UNIT = ('mu_pressure', 'spool')
+
+
+def empty_trace(ticks: int, units: int) -> Trace:
+    """Return a trace of ``ticks`` rows to be filled: (ticks,) or, per motor unit, (ticks, units).
+
+    ``recruitment_state`` is a whole number, the count of recruited motor units.
+    """
+    trace: Trace = {name: np.empty(ticks) for name in SCALARS}
+    trace |= {name: np.empty((ticks, units)) for name in PER_UNIT}
+    trace['recruitment_state'] = np.empty(ticks, dtype=np.int64)
+    return trace
+
+
+def save_trace(trace: Trace, path: Path) -> None:
+    """Write ``trace`` as an ``npz`` file; whole or not at all."""
+    with tempfile.NamedTemporaryFile(dir=path.parent, suffix='.tmp', delete=False) as file:
+        np.savez(file, **trace)  # type: ignore[arg-type]
+    os.replace(file.name, path)
+
+
+def load_trace(path: Path) -> Trace:
+    """Return the trace in ``path``; raises OSError or ValueError when it holds none."""
+    with np.load(path, allow_pickle=False) as data:
+        return {name: data[name] for name in data.files}
