@@ -183,6 +183,12 @@ def test_everything_missing_is_one_line_each(tree):
     assert err.count('\n') == err.count('fam: ') == len(TOOLS) + 1
 
 
+def test_a_path_with_a_space_is_refused(tmp_path):
+    status, _, err = Tree(tmp_path / 'my checkout').fam('setup')
+    assert status == 2
+    assert_one_line(err, 'space', str(tmp_path / 'my checkout'))
+
+
 @pytest.mark.parametrize('version', [(3, 6, 15), (3, 9, 2), (3, 14, 0)])
 def test_a_python_outside_the_range_is_named_and_nothing_is_written(tree, version):
     before = files(tree.root)
