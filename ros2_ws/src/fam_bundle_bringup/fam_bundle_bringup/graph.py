@@ -6,12 +6,11 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
-
-from fam_bundle_io.trace import Trace
-from fam_bundle_model.parameters import Configuration, write_yaml
+from typing import TYPE_CHECKING
 
 from fam_bundle_bringup.processes import NodeDied, NodeGroup, executable
+from fam_bundle_io.trace import Trace
+from fam_bundle_model.parameters import Configuration, write_yaml
 
 if TYPE_CHECKING:
     from fam_bundle_io.trace_recorder_node import TraceRecorder
@@ -35,14 +34,6 @@ class GraphFailed(RuntimeError):
         """Keep the trace beside the message."""
         super().__init__(message)
         self.trace = trace
-
-
-class GraphResult(NamedTuple):
-    """Trace of a run, and the wall times in s of its first tick and of all ticks."""
-
-    trace: Trace
-    first_tick_seconds: float
-    run_seconds: float
 
 
 @contextlib.contextmanager
@@ -74,31 +65,24 @@ def run_graph(
     configuration: Configuration,
     folder: Path,
     progress: Callable[[int], None] | None = None,
-    started: Callable[[NodeGroup], None] | None = None,
-) -> GraphResult:
+) -> Trace:
     """Run ``configuration`` through the graph and return its trace.
 
     The nodes' parameter file and what they print go to ``folder``. ``progress`` is called with
-    the ticks done so far, ``started`` with the processes once they run.
-    Raises GraphFailed when a node ends early or messages stay missing.
+    the ticks done so far. Raises GraphFailed when a node ends early or messages stay missing.
     """
     parameter_file = folder / 'parameters.yaml'
     write_yaml(configuration, parameter_file)
     units, ticks = len(configuration.fam.count), configuration.ticks()
-    begin, first = time.monotonic(), None
     with own_domain(), recording() as (recorder, listen), nodes_in(folder) as group:
         start_nodes(group, parameter_file, LOOP_LISTENERS + 1)
-        if started is not None:
-            started(group)
         try:
             while not group.finished('plant_simulator'):
                 listen(SLICE)
-                if first is None and recorder.ticks():
-                    first = time.monotonic()
                 if progress is not None:
                     progress(recorder.ticks())
-            end = time.monotonic()
-            while recorder.complete_ticks() < ticks and time.monotonic() < end + DRAIN_TIMEOUT:
+            drained = time.monotonic() + DRAIN_TIMEOUT
+            while recorder.complete_ticks() < ticks and time.monotonic() < drained:
                 listen(SLICE)
         except NodeDied as error:
             raise GraphFailed(str(error), recorder.trace(units)) from None
@@ -106,7 +90,7 @@ def run_graph(
     recorded = len(trace['time'])
     if recorded < ticks:
         raise GraphFailed(f'{ticks - recorded} of {ticks} ticks did not reach the trace', trace)
-    return GraphResult(trace, (first or end) - begin, end - (first or end))
+    return trace
 
 
 def nodes_in(folder: Path) -> NodeGroup:
@@ -118,10 +102,11 @@ def nodes_in(folder: Path) -> NodeGroup:
 def recording() -> Iterator[tuple['TraceRecorder', Callable[[float], None]]]:
     """Give a trace recorder in this process, and a function that listens for some seconds."""
     import rclpy
-    from fam_bundle_io.trace_recorder_node import TraceRecorder
-    from fam_bundle_node.loop_node import make_executor
     from rclpy.signals import SignalHandlerOptions
     from rclpy.task import Future
+
+    from fam_bundle_io.trace_recorder_node import TraceRecorder
+    from fam_bundle_node.loop_node import make_executor
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     try:

@@ -2,6 +2,7 @@
 """The lag table to and from its message; both are plain rows of doubles."""
 
 import numpy as np
+
 from fam_bundle_model.lag_table import LagTable
 from fam_bundle_msgs.msg import LagTable as LagTableMessage
 from fam_bundle_msgs.msg import MotorUnitLag

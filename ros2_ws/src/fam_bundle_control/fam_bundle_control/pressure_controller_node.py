@@ -6,13 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+
+from fam_bundle_control.pressure_loop import pressure_loop_step
 from fam_bundle_model.pressure_pi import pressure_gains
 from fam_bundle_msgs.msg import BundleState, PressureReference, RecruitmentState, ValveCommand
 from fam_bundle_node.loop_node import LoopNode, run_node
 from fam_bundle_node.stamps import StampClock
 from fam_bundle_node.ticks import TickJoin, check_finite, check_length
-
-from fam_bundle_control.pressure_loop import pressure_loop_step
 
 TOPICS = ('bundle_state', 'pressure_reference', 'recruitment_state')
 

@@ -32,7 +32,6 @@ class Recruitment(NamedTuple):
     strain_rate_time_constant: float
     force_time_constant: float
     minimum_strain_rate: float
-    pressure_reserve: float
     minimum_dwell: float
 
 
@@ -74,7 +73,6 @@ def recruitment(configuration: Configuration) -> Recruitment:
         strain_rate_time_constant=p.strain_rate_time_constant,
         force_time_constant=p.force_time_constant,
         minimum_strain_rate=p.minimum_strain_rate,
-        pressure_reserve=p.pressure_reserve,
         minimum_dwell=p.minimum_dwell,
     )
 
@@ -153,13 +151,13 @@ def recruitment_step(
     saturation = desaturation = math.inf
     moving_up = rate > law.minimum_strain_rate
     moving_down = rate < -law.minimum_strain_rate
+    margin = lag.drop + (compensation if law.pressure_compensation else 0.0)
+    effective = source_pressure - margin
     if recruited < len(units) and moving_up:
-        margin = lag.drop + (compensation if law.pressure_compensation else 0.0)
-        limit = modelled_strain(units, recruited, source_pressure - margin, load)
+        limit = modelled_strain(units, recruited, effective, load)
         saturation = time_to_reach(limit, strain, rate)
     if recruited > 1 and moving_down:
-        reserved = source_pressure - law.pressure_reserve
-        limit = modelled_strain(units, recruited - 1, reserved, load)
+        limit = modelled_strain(units, recruited - 1, effective, load)
         desaturation = time_to_reach(limit, strain, rate)
 
     newest = mu_pressure[recruited - 1]

@@ -4,6 +4,9 @@
 import sys
 
 import numpy as np
+
+from fam_bundle_control.lag_table_message import from_message
+from fam_bundle_control.recruitment import recruitment, recruitment_start, recruitment_step
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.lag_table import PHYSICS, LagTable, lag_table_hash
 from fam_bundle_msgs.msg import BundleState, RecruitmentState
@@ -12,9 +15,6 @@ from fam_bundle_node.loop_node import LoopNode, run_node
 from fam_bundle_node.qos import LATCHED
 from fam_bundle_node.stamps import StampClock
 from fam_bundle_node.ticks import check_finite, check_length
-
-from fam_bundle_control.lag_table_message import from_message
-from fam_bundle_control.recruitment import recruitment, recruitment_start, recruitment_step
 
 
 class RecruitmentSupervisor(LoopNode):

@@ -3,14 +3,13 @@
 
 import sys
 
+from fam_bundle_control.reference import strain_reference
+from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
 from fam_bundle_model.parameters import seconds
 from fam_bundle_msgs.msg import BundleState, PressureReference
 from fam_bundle_node.loop_node import LoopNode, run_node
 from fam_bundle_node.stamps import StampClock
 from fam_bundle_node.ticks import check_finite
-
-from fam_bundle_control.reference import strain_reference
-from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
 
 
 class StrainController(LoopNode):
@@ -18,9 +17,7 @@ class StrainController(LoopNode):
 
     def __init__(self) -> None:
         """Subscribe once somebody listens to the answer."""
-        super().__init__(
-            'strain_controller', ('strain_loop', 'source', 'reference', 'simulation')
-        )
+        super().__init__('strain_controller', ('strain_loop', 'source', 'reference', 'simulation'))
         self.law = strain_loop(self.configuration)
         self.state = strain_loop_start()
         self.clock = StampClock(self.configuration.period_ns())

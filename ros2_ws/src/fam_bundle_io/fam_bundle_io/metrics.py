@@ -4,7 +4,6 @@
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from fam_bundle_io.trace import Trace
 
@@ -21,16 +20,16 @@ def tracking(trace: Trace, start: float, stop: float) -> Tracking:
 
     Raises ValueError when the trace has fewer than two ticks in that window.
     """
-    time = trace['time'].astype(float)
+    time = trace['time']
     window = (time >= start - 1e-9) & (time < stop + 1e-9)
     if np.count_nonzero(window) < 2:
         raise ValueError(f'the trace has no ticks from {start:g} s to {stop:g} s')
-    error = np.abs(trace['strain_reference'] - trace['strain'])[window].astype(float)
+    error = np.abs(trace['strain_reference'] - trace['strain'])[window]
     return Tracking(float(error.sum() * (time[1] - time[0])), float(error.max()))
 
 
 def shift_times(trace: Trace) -> tuple[list[float], list[float]]:
     """Return the times in s of the upshifts and of the downshifts."""
     change = np.diff(trace['recruitment_state'].astype(int), prepend=1)
-    time: npt.NDArray[np.float64] = trace['time'].astype(float)
+    time = trace['time']
     return time[change > 0].tolist(), time[change < 0].tolist()

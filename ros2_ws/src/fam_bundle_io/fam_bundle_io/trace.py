@@ -4,11 +4,12 @@
 import os
 import tempfile
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
-Trace = dict[str, npt.NDArray[np.generic]]
+Trace = dict[str, npt.NDArray[Any]]
 
 SCALARS = (
     'time',
@@ -42,7 +43,7 @@ def empty_trace(ticks: int, units: int) -> Trace:
 def save_trace(trace: Trace, path: Path) -> None:
     """Write ``trace`` as an ``npz`` file; whole or not at all."""
     with tempfile.NamedTemporaryFile(dir=path.parent, suffix='.tmp', delete=False) as file:
-        np.savez(file, **trace)  # type: ignore[arg-type]
+        np.savez(file, **cast(Any, trace))
     os.replace(file.name, path)
 
 

@@ -4,13 +4,13 @@
 from collections.abc import Callable
 
 import numpy as np
-from fam_bundle_model.parameters import seconds
-from fam_bundle_msgs.msg import BundleState, PressureReference, RecruitmentState, ValveCommand
-from fam_bundle_node.qos import RECORDER_SUBSCRIPTION
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
 from fam_bundle_io.trace import Trace, empty_trace
+from fam_bundle_model.parameters import seconds
+from fam_bundle_msgs.msg import BundleState, PressureReference, RecruitmentState, ValveCommand
+from fam_bundle_node.qos import RECORDER_SUBSCRIPTION
 
 TOPICS = {
     'pressure_reference': PressureReference,

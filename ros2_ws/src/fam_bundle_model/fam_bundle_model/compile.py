@@ -50,7 +50,8 @@ def _numba_decorator() -> Callable[[Any], Any] | None:
     # numba checks only the file that defines a function, not those of the functions it inlines:
     # a cache folder of its own for each state of the sources keeps old code from being loaded.
     if 'NUMBA_CACHE_DIR' not in os.environ:
-        numba.config.CACHE_DIR = str(cache_directory() / f'compiled-{source_digest()}')
+        folder = cache_directory() / f'compiled-{source_digest()}'
+        setattr(numba.config, 'CACHE_DIR', str(folder))  # noqa: B010  numba declares it late
     decorator: Callable[[Any], Any] = numba.njit(cache=True, error_model='numpy')
     return decorator
 
@@ -63,4 +64,4 @@ def compiled(function: Function) -> Function:
 
     ``FAM_BUNDLE_INTERPRET=1`` in the environment leaves every function interpreted.
     """
-    return function if _DECORATOR is None else _DECORATOR(function)  # type: ignore[no-any-return]
+    return function if _DECORATOR is None else _DECORATOR(function)

@@ -7,7 +7,7 @@ tension, pressure gauge. The compressive regions are our closed forms with the p
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,8 +24,8 @@ class FamLaw(NamedTuple):
     """A FAM ready for evaluation: coefficients, and what depends on pressure alone as tables.
 
     ``compression`` has one row per pressure (uniform, from 0, ``pressure_step`` Pa apart) and the
-    columns buckling strain, its slope, collapse strain, its slope, folding spring (N m), its slope;
-    slopes per Pa. ``slack`` has one row per oil content of a slack FAM (uniform, from
+    columns buckling strain, its slope, collapse strain, its slope, folding spring (N m), its
+    slope; slopes per Pa. ``slack`` has one row per oil content of a slack FAM (uniform, from
     ``slack_volume``, ``slack_step`` m^3 apart): its pressure (Pa) and slope (Pa/m^3).
     """
 
@@ -206,9 +206,7 @@ class _Column(NamedTuple):
     collapse_moment_slope: float
 
 
-def fam_law(
-    fam: FamParameters, unit: int, maximum_pressure: float, bulk_modulus: float
-) -> FamLaw:
+def fam_law(fam: FamParameters, unit: int, maximum_pressure: float, bulk_modulus: float) -> FamLaw:
     """Return the law of the FAMs of motor unit ``unit`` (0 is the first recruited).
 
     The tables reach from 0 to ``maximum_pressure`` (Pa).
@@ -333,9 +331,7 @@ def _compression_table(law: FamLaw, column: _Column) -> npt.NDArray[np.float64]:
     return _with_slopes(pressures, values)
 
 
-def _with_slopes(
-    x: npt.NDArray[np.float64], values: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+def _with_slopes(x: npt.NDArray[Any], values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     """Return ``values`` (points, columns) with the monotone slope of each column beside it."""
     from scipy.interpolate import PchipInterpolator
 
@@ -350,9 +346,11 @@ def _with_slack_table(law: FamLaw, maximum_pressure: float, bulk_modulus: float)
     least = oil_of(law, 0.0, LARGEST_STRAIN, bulk_modulus)
     most = oil_of(law, maximum_pressure, LARGEST_STRAIN, bulk_modulus)
     contents = np.linspace(least, most, 4 * TABLE_POINTS)
-    pressures = [_slack_pressure(law, c, maximum_pressure, bulk_modulus) for c in contents.tolist()]
+    pressures = [
+        _slack_pressure(law, c, maximum_pressure, bulk_modulus) for c in contents.tolist()
+    ]
     return law._replace(
         slack_volume=least,
         slack_step=(most - least) / (len(contents) - 1),
-        slack=_with_slopes(contents, np.array(pressures)[:, np.newaxis]),
+        slack=_with_slopes(contents, np.array([pressures]).T),
     )

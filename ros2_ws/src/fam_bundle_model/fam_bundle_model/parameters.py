@@ -148,9 +148,6 @@ class RecruitmentParameters:
     strain_rate_time_constant: float = positive('s', 'filter of the strain rate')
     force_time_constant: float = positive('s', 'filter of the measured force')
     minimum_strain_rate: float = positive('1/s', 'slower is taken as standing still')
-    pressure_reserve: float = number(
-        'Pa', 'kept free below the source pressure at a downshift', minimum=0.0
-    )
     minimum_dwell: float = number('s', 'least time in a state before a downshift', minimum=0.0)
 
 

@@ -112,12 +112,12 @@ def per_unit(kind: type, unit: str, text: str, **bounds: Any) -> Any:
 
 def declarations(group: type) -> dict[str, Declaration]:
     """Return the declaration of each parameter of a group, by field name."""
-    return {f.name: f.metadata['declaration'] for f in dataclasses.fields(group)}  # type: ignore[arg-type]
+    return {f.name: f.metadata['declaration'] for f in dataclasses.fields(group)}
 
 
 def required(group: type) -> set[str]:
     """Return the names of the parameters of a group that have no default."""
-    fields = dataclasses.fields(group)  # type: ignore[arg-type]
+    fields = dataclasses.fields(group)
     return {f.name for f in fields if f.default is dataclasses.MISSING}
 
 

@@ -4,10 +4,11 @@
 from collections.abc import Iterable
 from typing import Any
 
-from fam_bundle_model.parameters import GROUPS, Configuration, make_configuration
-from fam_bundle_model.schema import Declaration, declarations
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
+
+from fam_bundle_model.parameters import GROUPS, Configuration, make_configuration
+from fam_bundle_model.schema import Declaration, declarations
 
 
 def declare_configuration(node: Node, groups: Iterable[str]) -> Configuration:

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import rclpy
-from fam_bundle_model.parameters import Configuration
-from fam_bundle_model.schema import ConfigurationError
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.task import Future
 
+from fam_bundle_model.parameters import Configuration
+from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.declare import declare_configuration
 from fam_bundle_node.qos import LOOP_PUBLISHER, LOOP_SUBSCRIPTION
 from fam_bundle_node.ticks import TickError, TickOrder

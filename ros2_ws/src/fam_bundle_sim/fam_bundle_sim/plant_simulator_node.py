@@ -5,11 +5,11 @@ import sys
 import time
 
 import numpy as np
+
 from fam_bundle_model.parameters import seconds
 from fam_bundle_msgs.msg import BundleState, ValveCommand
 from fam_bundle_node.loop_node import LoopNode, run_node
 from fam_bundle_node.ticks import TickError, check_finite, check_length
-
 from fam_bundle_sim.plant import plant, plant_step, resting_state, truth
 from fam_bundle_sim.sensors import measure, noise_samples, sensors
 
@@ -45,7 +45,7 @@ class PlantSimulator(LoopNode):
         self.ticks = self.configuration.ticks()
         self.step_ns = self.configuration.period_ns()
         self.tick = 0
-        self.published_at = time.monotonic()
+        self.started_at = self.published_at = time.monotonic()
         self.publisher = self.loop_publisher(BundleState, 'bundle_state')
         self.loop_subscription(ValveCommand, 'valve_command', self.on_valve_command)
         self.when_matched(self.publisher, self.configuration.run.listeners, self.start)
@@ -53,6 +53,7 @@ class PlantSimulator(LoopNode):
     def start(self) -> None:
         """Publish tick 0 and begin to watch for answers."""
         self.get_logger().info(f'running {self.ticks} ticks in lock-step')
+        self.started_at = time.monotonic()
         self.publish_state()
         self.create_timer(0.5, self.watch)
 
@@ -83,6 +84,8 @@ class PlantSimulator(LoopNode):
         check_finite('valve_command', command.tick, command.spool)
         self.tick += 1
         if self.tick == self.ticks:
+            elapsed = time.monotonic() - self.started_at
+            self.get_logger().info(f'ran {self.ticks} ticks in {elapsed:.4f} s')
             self.succeed()
             return
         plant_step(
