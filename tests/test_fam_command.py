@@ -142,6 +142,13 @@ def test_an_unknown_command_is_refused_in_one_line(tree):
     assert_one_line(err, "'dmeo'")
 
 
+@pytest.mark.parametrize('command', ['setup', 'shell'])
+def test_an_argument_that_would_be_ignored_is_refused(tree, command):
+    status, _, err = tree.fam(command, '-h')
+    assert status == 2
+    assert_one_line(err, command, 'no arguments')
+
+
 def test_python_3_6_parses_it():
     ast.parse((REPOSITORY / 'fam').read_text(), feature_version=(3, 6))
 
@@ -317,7 +324,6 @@ def test_run_lists_the_executables_when_one_is_unknown(tree):
 
 
 def test_run_without_an_executable_says_what_it_takes(tree):
-    tree.pretend_set_up()
     status, _, err = tree.fam('run', 'some_nodes')
     assert status == 2
     assert_one_line(err, 'PACKAGE EXECUTABLE')
