@@ -6,7 +6,6 @@ import sys
 import time
 from typing import Any
 
-from fam_bundle_control.lag_table_message import to_message
 from fam_bundle_model.lag_table import (
     PHYSICS,
     build_lag_table,
@@ -18,6 +17,7 @@ from fam_bundle_model.parameters import LagTableParameters
 from fam_bundle_model.schema import ConfigurationError, make_group
 from fam_bundle_msgs.msg import LagTable as LagTableMessage
 from fam_bundle_msgs.srv import GetLagTable, QueryLag, RebuildLagTable
+from fam_bundle_node.lag_table_message import to_message
 from fam_bundle_node.loop_node import LoopNode, run_node
 from fam_bundle_node.qos import LATCHED
 

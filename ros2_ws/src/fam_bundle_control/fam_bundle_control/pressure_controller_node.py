@@ -21,7 +21,7 @@ class PressureController(LoopNode):
     """Computes a tick when it holds the measurement and both references of that tick."""
 
     def __init__(self) -> None:
-        """Listen to the references at once, to the plant when the answer will be heard."""
+        """Compile the law before the first tick needs it."""
         super().__init__('pressure_controller', ('fam', 'pressure_loop', 'simulation'))
         units = len(self.configuration.fam.count)
         self.gains = pressure_gains(self.configuration.pressure_loop)
@@ -29,15 +29,40 @@ class PressureController(LoopNode):
         self.wanted, self.spool = np.zeros(units), np.zeros(units)
         self.saturated = np.zeros(units, dtype=np.bool_)
         self.clock = StampClock(self.configuration.period_ns())
+        self.command(0, 0.0, 0.0, 0.0, np.zeros(units), 1.0)  # compiles the law, changes nothing
         self.join = TickJoin(TOPICS)
         self.publisher = self.loop_publisher(ValveCommand, 'valve_command')
         self.listen(PressureReference, 'pressure_reference')
         self.listen(RecruitmentState, 'recruitment_state')
-        self.when_matched(self.publisher, 1, lambda: self.listen(BundleState, 'bundle_state'))
+        self.listen(BundleState, 'bundle_state')
 
     def listen(self, message_type: type, topic: str) -> None:
         """Subscribe to one of the three topics."""
         self.loop_subscription(message_type, topic, self.collector(topic))
+
+    def command(
+        self,
+        recruited: int,
+        pressure: float,
+        compensation: float,
+        source_pressure: float,
+        mu_pressure: np.ndarray,
+        dt: float,
+    ) -> None:
+        """Let the law fill the references, the spool commands and their saturation."""
+        pressure_loop_step(
+            self.gains,
+            self.integral,
+            recruited,
+            pressure,
+            compensation,
+            source_pressure,
+            mu_pressure,
+            dt,
+            self.wanted,
+            self.spool,
+            self.saturated,
+        )
 
     def collector(self, topic: str) -> Callable[[Any], None]:
         """Return the callback that answers once all three messages of a tick are there."""
@@ -58,18 +83,13 @@ class PressureController(LoopNode):
         check_finite('pressure_reference', seen.tick, (reference.pressure,))
         compensation = recruitment.pressure_compensation
         check_finite('recruitment_state', seen.tick, (compensation,))
-        pressure_loop_step(
-            self.gains,
-            self.integral,
+        self.command(
             recruitment.recruited,
             reference.pressure,
             compensation,
             seen.source_pressure,
             np.array(seen.mu_pressure),
             self.clock.since_last(seen.header.stamp),
-            self.wanted,
-            self.spool,
-            self.saturated,
         )
         self.publisher.publish(
             ValveCommand(

@@ -5,12 +5,18 @@ import sys
 
 import numpy as np
 
-from fam_bundle_control.lag_table_message import from_message
-from fam_bundle_control.recruitment import recruitment, recruitment_start, recruitment_step
+from fam_bundle_control.recruitment import (
+    RecruitmentOutput,
+    recruitment,
+    recruitment_start,
+    recruitment_step,
+)
+from fam_bundle_control.recruitment import RecruitmentState as RecruitmentMemory
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.lag_table import PHYSICS, LagTable, lag_table_hash
 from fam_bundle_msgs.msg import BundleState, RecruitmentState
 from fam_bundle_msgs.msg import LagTable as LagTableMessage
+from fam_bundle_node.lag_table_message import from_message
 from fam_bundle_node.loop_node import LoopNode, run_node
 from fam_bundle_node.qos import LATCHED
 from fam_bundle_node.stamps import StampClock
@@ -21,7 +27,7 @@ class RecruitmentSupervisor(LoopNode):
     """Waits for the lag table, then decides at each tick."""
 
     def __init__(self) -> None:
-        """Wait for the table, then for somebody who listens to the answer."""
+        """Wait for the table."""
         super().__init__('recruitment_supervisor', ('recruitment', *PHYSICS))
         self.law = recruitment(self.configuration)
         self.units = motor_units(self.configuration)
@@ -43,22 +49,36 @@ class RecruitmentSupervisor(LoopNode):
         first = self.table is None
         self.table = from_message(message)
         if first:
-            self.when_matched(
-                self.publisher,
-                1,
-                lambda: self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state),
-            )
+            self.decide(0.0, 0.0, 0.0, np.zeros(len(self.units)), 1.0)  # compiles the law
+            self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state)
+
+    def decide(
+        self,
+        strain: float,
+        force: float,
+        source_pressure: float,
+        mu_pressure: np.ndarray,
+        dt: float,
+    ) -> tuple[RecruitmentMemory, RecruitmentOutput]:
+        """Return the law's next state and its output."""
+        return recruitment_step(
+            self.law,
+            self.units,
+            self.table,
+            self.state,
+            strain,
+            force,
+            source_pressure,
+            mu_pressure,
+            dt,
+        )
 
     def on_bundle_state(self, seen: BundleState) -> None:
         """Answer one tick."""
         check_length('bundle_state', seen.tick, seen.mu_pressure, len(self.units))
         measured = (seen.strain, seen.force, seen.source_pressure, *seen.mu_pressure)
         check_finite('bundle_state', seen.tick, measured)
-        self.state, output = recruitment_step(
-            self.law,
-            self.units,
-            self.table,
-            self.state,
+        self.state, output = self.decide(
             seen.strain,
             seen.force,
             seen.source_pressure,

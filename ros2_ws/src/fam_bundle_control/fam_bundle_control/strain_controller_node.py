@@ -16,17 +16,14 @@ class StrainController(LoopNode):
     """Owns the reference trajectory and the outer PI."""
 
     def __init__(self) -> None:
-        """Subscribe once somebody listens to the answer."""
+        """Compile the law before the first tick needs it."""
         super().__init__('strain_controller', ('strain_loop', 'source', 'reference', 'simulation'))
         self.law = strain_loop(self.configuration)
         self.state = strain_loop_start()
         self.clock = StampClock(self.configuration.period_ns())
         self.publisher = self.loop_publisher(PressureReference, 'pressure_reference')
-        self.when_matched(
-            self.publisher,
-            1,
-            lambda: self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state),
-        )
+        strain_loop_step(self.law, self.state, 0.0, 0.0, 0.0, 0.0, 1.0)
+        self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state)
 
     def on_bundle_state(self, seen: BundleState) -> None:
         """Answer one tick."""

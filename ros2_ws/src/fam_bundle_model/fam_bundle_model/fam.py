@@ -332,12 +332,10 @@ def _compression_table(law: FamLaw, column: _Column) -> npt.NDArray[np.float64]:
 
 
 def _with_slopes(x: npt.NDArray[Any], values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
-    """Return ``values`` (points, columns) with the monotone slope of each column beside it."""
-    from scipy.interpolate import PchipInterpolator
-
+    """Return ``values`` (points, columns) with the slope of each column beside it."""
     table = np.empty((len(x), 2 * values.shape[1]))
     table[:, 0::2] = values
-    table[:, 1::2] = PchipInterpolator(x, values, axis=0).derivative()(x)
+    table[:, 1::2] = np.gradient(values, x, axis=0, edge_order=2)
     return table
 
 

@@ -145,8 +145,8 @@ def build_lag_table(configuration: Configuration) -> LagTable:
     """
     grid, nominal = configuration.lag_table, configuration.source.nominal_pressure
     units = motor_units(configuration)
-    sources = np.linspace(grid.minimum_source * nominal, nominal, grid.source_points)
-    targets = np.linspace(0.0, nominal, grid.deslack_points)
+    sources = _axis(grid.minimum_source * nominal, nominal, grid.source_points)
+    targets = _axis(0.0, nominal, grid.deslack_points)
     shape = (len(units), grid.source_points, grid.deslack_points)
     lag, drop = np.empty(shape), np.empty(shape)
     first: dict[tuple[float, int], int] = {}
@@ -168,6 +168,10 @@ def build_lag_table(configuration: Configuration) -> LagTable:
         else:
             lag[i], drop[i] = lag[same], drop[same]
     return LagTable(sources, targets, lag, drop)
+
+
+def _axis(low: float, high: float, points: int) -> npt.NDArray[np.float64]:
+    return np.asarray(np.linspace(low, high, points), dtype=np.float64)
 
 
 @compiled

@@ -17,8 +17,6 @@ from fam_bundle_node.declare import declare_configuration
 from fam_bundle_node.qos import LOOP_PUBLISHER, LOOP_SUBSCRIPTION
 from fam_bundle_node.ticks import TickError, TickOrder
 
-MATCHING_PERIOD = 0.02  # s between two looks at who has subscribed
-
 
 class LoopNode(Node):
     """A node that publishes and consumes one message per tick."""
@@ -49,22 +47,6 @@ class LoopNode(Node):
                 self.fail(str(error))
 
         self.create_subscription(message_type, topic, checked, LOOP_SUBSCRIPTION)
-
-    def when_matched(
-        self, publisher: Publisher, listeners: int, action: Callable[[], None]
-    ) -> None:
-        """Call ``action`` once ``publisher`` has as many subscriptions as ``listeners``.
-
-        Every node subscribes to ``bundle_state`` last, when its own answer will be heard: so the
-        plant knows from its own subscriptions that the whole loop is ready.
-        """
-
-        def look() -> None:
-            if publisher.get_subscription_count() >= listeners:
-                timer.cancel()
-                action()
-
-        timer = self.create_timer(MATCHING_PERIOD, look)
 
     def succeed(self) -> None:
         """End the node with exit status 0."""

@@ -16,7 +16,9 @@ def _reliable(depth: int, durability: DurabilityPolicy) -> QoSProfile:
     )
 
 
-LOOP_PUBLISHER = _reliable(WRITER_DEPTH, DurabilityPolicy.VOLATILE)
-LOOP_SUBSCRIPTION = _reliable(1, DurabilityPolicy.VOLATILE)
-RECORDER_SUBSCRIPTION = _reliable(5 * WRITER_DEPTH, DurabilityPolicy.VOLATILE)
+# Transient local: whoever is discovered a moment late still gets the tick that waits for its
+# answer, so that no order of start-up can stall the loop.
+LOOP_PUBLISHER = _reliable(WRITER_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
+LOOP_SUBSCRIPTION = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
+RECORDER_SUBSCRIPTION = _reliable(5 * WRITER_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)

@@ -26,6 +26,8 @@ GROUPS = (
     'run',
 )
 
+MATCHING_PERIOD = 0.02  # s between two looks at who listens
+
 
 class PlantSimulator(LoopNode):
     """Takes tick k + 1 only when the valve command of tick k has come (lock-step).
@@ -48,10 +50,14 @@ class PlantSimulator(LoopNode):
         self.started_at = self.published_at = time.monotonic()
         self.publisher = self.loop_publisher(BundleState, 'bundle_state')
         self.loop_subscription(ValveCommand, 'valve_command', self.on_valve_command)
-        self.when_matched(self.publisher, self.configuration.run.listeners, self.start)
+        self.advance(self.state.copy(), np.zeros(units))  # compiles the plant
+        self.timer = self.create_timer(MATCHING_PERIOD, self.start)
 
     def start(self) -> None:
-        """Publish tick 0 and begin to watch for answers."""
+        """Publish tick 0 once everybody listens, and begin to watch for answers."""
+        if self.publisher.get_subscription_count() < self.configuration.run.listeners:
+            return
+        self.timer.cancel()
         self.get_logger().info(f'running {self.ticks} ticks in lock-step')
         self.started_at = time.monotonic()
         self.publish_state()
@@ -88,14 +94,13 @@ class PlantSimulator(LoopNode):
             self.get_logger().info(f'ran {self.ticks} ticks in {elapsed:.4f} s')
             self.succeed()
             return
-        plant_step(
-            self.rig,
-            self.state,
-            np.clip(command.spool, -1.0, 1.0),
-            seconds(self.step_ns),
-            self.configuration.simulation.substeps,
-        )
+        self.advance(self.state, np.clip(command.spool, -1.0, 1.0))
         self.publish_state()
+
+    def advance(self, state: np.ndarray, spool: np.ndarray) -> None:
+        """Advance ``state`` in place by one tick."""
+        substeps = self.configuration.simulation.substeps
+        plant_step(self.rig, state, spool, seconds(self.step_ns), substeps)
 
 
 def main() -> None:

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line: ``./fam experiment``, ``./fam demo`` and ``./fam bench``."""
+
+import argparse
+import signal
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from fam_bundle_bringup.experiment import (
+    PACES,
+    checked_configuration,
+    default_configuration,
+    prepare_folder,
+)
+from fam_bundle_model.parameters import SCHEMES, Configuration
+from fam_bundle_model.schema import ConfigurationError
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that refuses in one line."""
+
+    def error(self, message: str) -> Any:
+        """Print one line and exit with status 2."""
+        self.exit(2, f'{self.prog}: {message}; see {self.prog} --help\n')
+
+
+def parser() -> Parser:
+    """Return the parser of all commands."""
+    top = Parser(prog='fam', description='Variable-recruitment FAM bundles under ROS 2.')
+    commands = top.add_subparsers(dest='command', required=True, metavar='COMMAND')
+    _add_experiment(commands)
+    demo = commands.add_parser(
+        'demo', help="the paper's experiment under every scheme, its table and its figures"
+    )
+    _add_common(demo, Path('runs/demo'))
+    bench = commands.add_parser('bench', help='how fast the loop runs on this machine')
+    _add_common(bench, Path('runs/bench'))
+    return top
+
+
+def _add_common(command: argparse.ArgumentParser, out: Path) -> None:
+    command.add_argument(
+        '--config', type=Path, help='parameter file (default: the rig of the paper, lhacd.yaml)'
+    )
+    command.add_argument(
+        '--out', type=Path, default=out, metavar='DIR', help='folder for results (%(default)s)'
+    )
+
+
+def _add_experiment(commands: Any) -> None:
+    experiment = commands.add_parser('experiment', help='one run, its trace and its metrics')
+    experiment.add_argument(
+        '--scheme',
+        metavar='|'.join(SCHEMES),
+        help='what decides a shift, and what is compensated (default: as configured)',
+    )
+    experiment.add_argument(
+        '--threshold',
+        metavar='SHARE',
+        help='upshift threshold of the threshold schemes over the nominal pressure',
+    )
+    experiment.add_argument(
+        '--pace',
+        choices=PACES,
+        default='lockstep',
+        help='through the node graph, or the same loop in one process (%(default)s)',
+    )
+    experiment.add_argument('--reference', metavar='sine', help='waveform of the strain reference')
+    experiment.add_argument('--amplitude', metavar='STRAIN', help='half of its peak strain')
+    experiment.add_argument('--frequency', metavar='HZ', help='its frequency')
+    experiment.add_argument('--cycles', metavar='N', help='how many cycles to run')
+    _add_common(experiment, Path('runs/experiment'))
+
+
+def changes_of(options: argparse.Namespace) -> Mapping[str, Mapping[str, Any]]:
+    """Return the configuration changes that the options ask for."""
+    wanted = {
+        ('recruitment', 'scheme'): options.scheme,
+        ('recruitment', 'upshift_threshold'): options.threshold,
+        ('reference', 'kind'): options.reference,
+        ('reference', 'amplitude'): options.amplitude,
+        ('reference', 'frequency'): options.frequency,
+        ('reference', 'cycles'): options.cycles,
+    }
+    changes: dict[str, dict[str, Any]] = {}
+    for (group, name), value in wanted.items():
+        if value is not None:
+            changes.setdefault(group, {})[name] = value
+    return changes
+
+
+def run_experiment_command(options: argparse.Namespace, configuration: Configuration) -> None:
+    """Run one experiment and print its metrics."""
+    from fam_bundle_bringup.experiment import run_experiment
+    from fam_bundle_bringup.progress import progress_bar
+
+    scheme = configuration.recruitment.scheme
+    with progress_bar(f'{scheme}, {options.pace}', configuration.ticks()) as progress:
+        result = run_experiment(configuration, options.pace, options.out, progress)
+    metrics = result.metrics
+    window = f'{metrics["metrics_from"]:g} to {metrics["metrics_to"]:g} s'
+    print(f'{scheme}: {metrics["ticks"]} ticks; over {window}:')
+    print(f'  IAE           {metrics["iae"]:.4f} s')
+    print(f'  maximum error {metrics["max_error"]:.4f}')
+    print(f'  upshifts      {_times(metrics["upshift_times"])}')
+    print(f'  downshifts    {_times(metrics["downshift_times"])}')
+    print(f'written to {options.out}')
+
+
+def _times(times: Sequence[float]) -> str:
+    return ', '.join(f'{t:.3f} s' for t in times) or 'none'
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status."""
+    options = parser().parse_args(arguments)
+    # Every exit unwinds, so that no process is left behind.
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        changes = changes_of(options) if options.command == 'experiment' else {}
+        configuration = checked_configuration(options.config or default_configuration(), changes)
+        prepare_folder(options.out)
+        if options.command == 'experiment':
+            run_experiment_command(options, configuration)
+        elif options.command == 'demo':
+            from fam_bundle_bringup.demo import run_demo
+
+            run_demo(configuration, options.out)
+        else:
+            from fam_bundle_bringup.bench import run_bench
+
+            run_bench(configuration, options.out)
+    except ConfigurationError as error:
+        print(f'fam {options.command}: {error}', file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f'fam {options.command}: interrupted', file=sys.stderr)
+        return 130
+    except RuntimeError as error:
+        print(f'fam {options.command}: {error}', file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One experiment: check, run at a pace, and write its folder."""
+
+import importlib.metadata
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fam_bundle_bringup.graph import GraphFailed, run_graph
+from fam_bundle_bringup.offline import run_offline
+from fam_bundle_io.metrics import Tracking, shift_times, tracking
+from fam_bundle_io.trace import Trace, save_trace
+from fam_bundle_model.bundle import check_reachable, motor_units
+from fam_bundle_model.parameters import Configuration, load_configuration, write_yaml
+from fam_bundle_model.schema import ConfigurationError
+
+PACES = ('lockstep', 'offline')
+RESULTS = ('metrics.json', 'trace.npz')
+
+
+class Result(NamedTuple):
+    """Trace of a run and its metrics over the last cycle."""
+
+    trace: Trace
+    metrics: dict[str, Any]
+
+
+def default_configuration() -> Path:
+    """Return the installed configuration of the paper's rig."""
+    from ament_index_python.packages import get_package_share_directory
+
+    return Path(get_package_share_directory('fam_bundle_bringup')) / 'config' / 'lhacd.yaml'
+
+
+def checked_configuration(
+    path: Path, changes: Mapping[str, Mapping[str, Any]] | None = None
+) -> Configuration:
+    """Return the configuration in ``path`` with ``changes`` if the rig can do what it asks.
+
+    Raises ConfigurationError naming parameter, value and bound.
+    """
+    configuration = load_configuration(path, changes)
+    check_reachable(configuration, motor_units(configuration))
+    return configuration
+
+
+def last_cycle(configuration: Configuration) -> tuple[float, float]:
+    """Return start and end of the last cycle in s: the settled one, if there are two."""
+    end = configuration.duration()
+    return end - 1.0 / configuration.reference.frequency, end
+
+
+def measure_tracking(configuration: Configuration, trace: Trace) -> Tracking:
+    """Return IAE and largest error over the last cycle."""
+    return tracking(trace, *last_cycle(configuration))
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what shapes a result."""
+    found = {'python': platform.python_version()}
+    for name in ('fam_bundle_bringup', 'numpy', 'scipy', 'numba'):
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = 'none'
+    return found
+
+
+def metrics_of(configuration: Configuration, pace: str, trace: Trace) -> dict[str, Any]:
+    """Return what ``metrics.json`` holds."""
+    start, stop = last_cycle(configuration)
+    up, down = shift_times(trace)
+    return {
+        'scheme': configuration.recruitment.scheme,
+        **measure_tracking(configuration, trace)._asdict(),
+        'ticks': len(trace['time']),
+        'upshift_times': up,
+        'downshift_times': down,
+        'metrics_from': start,
+        'metrics_to': stop,
+        'upshift_threshold': configuration.recruitment.upshift_threshold,
+        'pace': pace,
+        'parameters_hash': configuration.hash(),
+        'versions': versions(),
+    }
+
+
+def write_json(content: Any, path: Path) -> None:
+    """Write ``content`` as JSON; whole or not at all."""
+    with tempfile.NamedTemporaryFile(
+        'w', dir=path.parent, suffix='.tmp', delete=False, encoding='utf-8'
+    ) as file:
+        json.dump(content, file, indent=1)
+        file.write('\n')
+    os.replace(file.name, path)
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make ``folder`` and take away the results of an earlier run in it.
+
+    Raises ConfigurationError when it cannot be written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in RESULTS:
+            (folder / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f'--out {folder}: cannot be written ({error.strerror})') from None
+    if not os.access(folder, os.W_OK):
+        raise ConfigurationError(f'--out {folder}: cannot be written')
+
+
+def run_experiment(
+    configuration: Configuration,
+    pace: str,
+    folder: Path,
+    progress: Callable[[int], None] | None = None,
+) -> Result:
+    """Run ``configuration`` and write its parameters, trace and metrics to ``folder``.
+
+    Raises ConfigurationError when ``folder`` cannot be written, and GraphFailed when a node ends
+    early; the trace of the ticks until then is kept.
+    """
+    prepare_folder(folder)
+    if pace == 'offline':
+        write_yaml(configuration, folder / 'parameters.yaml')
+        trace = run_offline(configuration, progress)
+    else:
+        try:
+            trace = run_graph(configuration, folder, progress)
+        except GraphFailed as error:
+            save_trace(error.trace, folder / 'trace.npz')
+            raise
+    save_trace(trace, folder / 'trace.npz')
+    metrics = metrics_of(configuration, pace, trace)
+    write_json(metrics, folder / 'metrics.json')
+    return Result(trace, metrics)

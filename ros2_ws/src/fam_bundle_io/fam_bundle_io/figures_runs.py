@@ -1,0 +1,299 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of runs: one run (Figures 11-13), several (Figure 14), and a prediction (Figure 7)."""
+
+from collections.abc import Mapping
+from itertools import accumulate
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from fam_bundle_io.figures_style import (
+    DOWNSHIFT,
+    KILOPASCAL,
+    LAG,
+    MEASURED,
+    PERCENT,
+    REFERENCE,
+    SOURCE,
+    UPSHIFT,
+    Array,
+    last_cycle,
+    legend_above,
+    legend_beside,
+    mark,
+    scheme_style,
+    signal,
+    styled,
+    unit_style,
+)
+from fam_bundle_io.metrics import shift_times
+from fam_bundle_io.trace import Trace
+from fam_bundle_model.parameters import Configuration
+
+LEAD = 0.05  # a prediction is shown this share of a cycle before its shift
+
+
+def _shifts_within(trace: Trace, window: slice) -> tuple[list[float], list[float]]:
+    """Return the times in s of the upshifts and of the downshifts in ``window``."""
+    time = signal(trace, 'time')[window]
+    ups, downs = shift_times(trace)
+    return (
+        [t for t in ups if time[0] <= t <= time[-1]],
+        [t for t in downs if time[0] <= t <= time[-1]],
+    )
+
+
+@styled
+def run_figure(trace: Trace, title: str) -> Figure:
+    """Return the last cycle of a run of any scheme (Figures 11, 12 and 13).
+
+    Panels: strain (%); times to saturation and desaturation beside the recruitment lag (s),
+    where the trace holds any; recruitment state; pressures (kPa); strain error (%). A vertical
+    dashed line marks each shift.
+    """
+    window = last_cycle(trace)
+    predicted = any(
+        np.isfinite(trace[name][window].astype(float)).any()
+        for name in ('time_to_saturation', 'time_to_desaturation')
+    )
+    heights = [3.0, 2.4, 1.1, 3.0, 1.8] if predicted else [3.0, 1.1, 3.0, 1.8]
+    figure = Figure(figsize=(7.2, 0.7 * sum(heights)))
+    panels = list(
+        figure.subplots(len(heights), 1, sharex=True, gridspec_kw={'height_ratios': heights})
+    )
+    figure.suptitle(title)
+    time = signal(trace, 'time')[window]
+    _draw_tracking(panels[0], trace, window)
+    if predicted:
+        _draw_predictions(panels[1], trace, window)
+    _draw_state(panels[-3], trace, window)
+    _draw_pressures(panels[-2], trace, window)
+    error = signal(trace, 'strain_reference') - signal(trace, 'strain')
+    panels[-1].axhline(0.0, color='#999999', linewidth=0.7)
+    panels[-1].plot(time, PERCENT * error[window], **MEASURED)
+    panels[-1].set_ylabel('error\n(% strain)')
+    panels[-1].set_xlabel('time (s)')
+    panels[-1].set_xlim(time[0], time[-1])
+    ups, downs = _shifts_within(trace, window)
+    for letter, axes in zip('abcde', panels, strict=False):
+        mark(axes, ups + downs)
+        axes.set_title(f'({letter})', fontweight='bold', pad=2.0)
+    figure.align_ylabels(panels)
+    return figure
+
+
+def _draw_tracking(axes: Axes, trace: Trace, window: slice) -> None:
+    time = signal(trace, 'time')[window]
+    axes.plot(time, PERCENT * signal(trace, 'strain')[window], label='measured', **MEASURED)
+    axes.plot(
+        time, PERCENT * signal(trace, 'strain_reference')[window], label='reference', **REFERENCE
+    )
+    axes.set_ylabel('strain (%)')
+    legend_beside(axes)
+
+
+def _draw_predictions(axes: Axes, trace: Trace, window: slice) -> None:
+    time = signal(trace, 'time')[window]
+    lag = signal(trace, 'recruitment_lag')[window]
+    axes.plot(time, lag, color=LAG, label='recruitment\nlag')
+    for name, colour, label in (
+        ('time_to_saturation', UPSHIFT, 'to saturation'),
+        ('time_to_desaturation', DOWNSHIFT, 'to desaturation'),
+    ):
+        axes.plot(time, signal(trace, name)[window], color=colour, label=label)
+    # Far from a shift the times are long and say nothing: the scale is that of the lag.
+    longest = float(np.nanmax(lag, initial=0.1))
+    axes.set_ylim(-2.0 * longest, 4.0 * longest)
+    axes.axhline(0.0, color='#999999', linewidth=0.7, zorder=1.0)
+    axes.set_ylabel('time (s)')
+    legend_beside(axes)
+
+
+def _draw_state(axes: Axes, trace: Trace, window: slice) -> None:
+    units = trace['mu_pressure'].shape[1]
+    axes.step(
+        signal(trace, 'time')[window],
+        signal(trace, 'recruitment_state')[window],
+        where='post',
+        color='#000000',
+    )
+    axes.set_yticks(range(1, units + 1))
+    axes.set_ylim(0.7, units + 0.3)
+    axes.set_ylabel('state')
+
+
+def _draw_pressures(axes: Axes, trace: Trace, window: slice) -> None:
+    time = signal(trace, 'time')[window]
+    source = KILOPASCAL * signal(trace, 'source_pressure')[window]
+    axes.plot(time, source, label='source', **SOURCE)
+    for unit, pressure in enumerate(signal(trace, 'mu_pressure')[window].T):
+        axes.plot(time, KILOPASCAL * pressure, label=f'MU{unit + 1}', **unit_style(unit))
+    axes.set_ylabel('pressure (kPa)')
+    legend_beside(axes)
+
+
+@styled
+def comparison_figure(traces: Mapping[str, Trace]) -> Figure:
+    """Return how the schemes in ``traces`` (by their names) track the last cycle (Figure 14).
+
+    Panels: reference and strain (%) around the first upshifts, a triangle at each; strain errors
+    (%) over the whole cycle. Times in s from the start of the cycle.
+    """
+    figure = Figure(figsize=(7.2, 5.6))
+    near, whole = figure.subplots(2, 1, gridspec_kw={'height_ratios': [3.0, 2.0]})
+    firsts: list[float] = []
+    shown: list[tuple[Array, Array]] = []
+    for position, (name, trace) in enumerate(traces.items()):
+        window, style = last_cycle(trace), scheme_style(position)
+        time = signal(trace, 'time')[window]
+        start = time[0]
+        strain = PERCENT * signal(trace, 'strain')[window]
+        reference = PERCENT * signal(trace, 'strain_reference')[window]
+        if position == 0:
+            near.plot(time - start, reference, label='reference', **REFERENCE)
+        near.plot(time - start, strain, label=name, **style)
+        whole.plot(time - start, reference - strain, **style)
+        shown += [(time - start, strain), (time - start, reference)]
+        ups = _shifts_within(trace, window)[0]
+        if ups:
+            firsts.append(ups[0] - start)
+            at_shift = np.interp(ups[0], time, strain)
+            near.plot(ups[0] - start, at_shift, marker='^', markersize=6, color=style['color'])
+    near.set_ylabel('strain (%)')
+    if firsts:
+        length = max(time[-1] for time, _ in shown)
+        _zoom(near, shown, min(firsts) - 0.03 * length, max(firsts) + 0.15 * length)
+    else:
+        near.set_title('no upshift in this cycle')
+    legend_beside(near)
+    whole.axhline(0.0, color='#999999', linewidth=0.7, zorder=1.0)
+    whole.set_xlim(0.0, max(time[-1] for time, _ in shown))
+    whole.set_ylabel('error (% strain)')
+    whole.set_xlabel('time from the start of the cycle (s)')
+    return figure
+
+
+def _zoom(axes: Axes, curves: list[tuple[Array, Array]], start: float, stop: float) -> None:
+    """Limit ``axes`` to ``start`` to ``stop`` and to the heights of ``curves`` in between."""
+    inside = np.concatenate([y[(x >= start) & (x <= stop)] for x, y in curves])
+    room = 0.04 * (np.nanmax(inside) - np.nanmin(inside))
+    axes.set_xlim(start, stop)
+    axes.set_ylim(np.nanmin(inside) - room, np.nanmax(inside) + room)
+
+
+class Prediction(NamedTuple):
+    """One tick's prediction: time (s), strain, strain rate (1/s), lag (s), time to limit (s)."""
+
+    time: float
+    strain: float
+    rate: float
+    lag: float
+    time_to_limit: float
+
+    def limit(self) -> float:
+        """Return the modelled strain limit: where the expected strain stands at that time."""
+        return self.strain + self.rate * self.time_to_limit
+
+
+def prediction_before(
+    trace: Trace, configuration: Configuration, name: str, shift: float
+) -> Prediction | None:
+    """Return the prediction a twentieth of a cycle before the shift at ``shift`` s.
+
+    ``name`` is ``time_to_saturation`` or ``time_to_desaturation``. Where it does not apply at
+    that instant the first later one counts, up to the shift; None where there is none.
+    """
+    time = signal(trace, 'time')
+    earliest = shift - LEAD / configuration.reference.frequency
+    applies = np.isfinite(signal(trace, name)) & (time >= earliest) & (time <= shift)
+    if not applies.any():
+        return None
+    at = int(np.argmax(applies))
+    # The trace holds no strain rate: the filter of the recruitment law, on the same samples.
+    strain, period = signal(trace, 'strain'), time[1] - time[0]
+    share = period / (configuration.recruitment.strain_rate_time_constant + period)
+    differences = (np.diff(strain[: at + 1]) / period).tolist()
+    *_, rate = accumulate(differences, lambda r, d: r + (d - r) * share, initial=0.0)
+    return Prediction(
+        float(time[at]),
+        float(strain[at]),
+        rate,
+        float(signal(trace, 'recruitment_lag')[at]),
+        float(signal(trace, name)[at]),
+    )
+
+
+@styled
+def prediction_figure(trace: Trace, configuration: Configuration) -> Figure:
+    """Return the prediction before the last upshift and before the last downshift (Figure 7).
+
+    Each panel: strain (%), the expectation E(t) at constant rate from one instant, the modelled
+    strain limit, and the times (s) to saturation or desaturation and of the recruitment lag.
+    """
+    figure = Figure(figsize=(7.2, 3.7))
+    panels = figure.subplots(1, 2)
+    ups, downs = shift_times(trace)
+    for axes, word, times, name, symbol, colour in (
+        (panels[0], 'upshift', ups, 'time_to_saturation', 'sat', UPSHIFT),
+        (panels[1], 'downshift', downs, 'time_to_desaturation', 'desat', DOWNSHIFT),
+    ):
+        found = prediction_before(trace, configuration, name, times[-1]) if times else None
+        if found is None:
+            reason = f'no prediction before the {word}' if times else f'no {word} in this run'
+            axes.text(0.5, 0.5, reason, transform=axes.transAxes, ha='center', va='center')
+            axes.set_axis_off()
+        else:
+            axes.set_title(f'before the {word} at {times[-1]:.3f} s', pad=42.0)
+            _draw_prediction(axes, trace, found, times[-1], symbol, colour)
+    return figure
+
+
+def _draw_prediction(
+    axes: Axes, trace: Trace, found: Prediction, shift: float, symbol: str, colour: str
+) -> None:
+    reach = found.time + found.time_to_limit
+    span = max(shift, reach, found.time + found.lag) - min(found.time, reach)
+    start, stop = min(found.time, reach) - 0.35 * span, max(shift, reach) + 0.35 * span
+    time, strain = signal(trace, 'time'), PERCENT * signal(trace, 'strain')
+    window = (time >= start) & (time <= stop)
+    axes.plot(time[window], strain[window], label='measured', **MEASURED)
+    ends = np.array([min(found.time, reach), max(found.time, reach) + 0.15 * span])
+    expected = PERCENT * (found.strain + found.rate * (ends - found.time))
+    axes.plot(ends, expected, color='#000000', linestyle='-.', linewidth=1.0, label='$E(t)$')
+    limit = PERCENT * found.limit()
+    axes.axhline(limit, color='#CC79A7', linewidth=1.3, label='strain limit')
+    axes.plot(found.time, PERCENT * found.strain, 'o', color='#000000', markersize=4.5)
+    axes.plot(reach, limit, 's', color=colour, markersize=5)
+    mark(axes, [shift])
+    axes.set_xlim(start, stop)
+    low, high = axes.get_ylim()
+    height = high - low
+    # Two arrows below all curves; how long they are against each other decides the shift.
+    axes.set_ylim(low - 0.3 * height, high)
+    for level, length, name, shade in (
+        (low - 0.06 * height, found.time_to_limit, rf'$t_\mathrm{{{symbol}}}$', colour),
+        (low - 0.2 * height, found.lag, r'$t_\mathrm{lag}$', LAG),
+    ):
+        ends = (found.time, found.time + length)
+        axes.annotate(
+            '',
+            (ends[1], level),
+            (ends[0], level),
+            arrowprops={'arrowstyle': '->', 'color': shade, 'shrinkA': 0, 'shrinkB': 0},
+        )
+        axes.annotate(
+            f'{name} = {length:.3f} s',
+            (max(ends), level),
+            (5, 0),
+            textcoords='offset points',
+            color=shade,
+            va='center',
+        )
+    axes.vlines(
+        found.time, low - 0.26 * height, PERCENT * found.strain, colors='#999999', linewidths=0.7
+    )
+    axes.set_xlabel('time (s)')
+    axes.set_ylabel('strain (%)')
+    legend_above(axes, 2)

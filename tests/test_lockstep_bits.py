@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The graph in lock-step and the loop in one process give the same trace to the last bit."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fam_bundle_bringup.graph import run_graph
+from fam_bundle_bringup.offline import run_offline
+from fam_bundle_io.trace import PER_UNIT, SCALARS, Trace
+from fam_bundle_model.parameters import SCHEMES, Configuration
+
+
+def assert_same_bits(one: Trace, other: Trace) -> None:
+    assert set(one) == set(other) == {*SCALARS, *PER_UNIT}
+    for name in one:
+        assert one[name].dtype == other[name].dtype, name
+        assert one[name].tobytes() == other[name].tobytes(), name
+
+
+@pytest.mark.parametrize('scheme', SCHEMES)
+def test_graph_equals_one_process(
+    scheme: str, quick: Callable[..., Configuration], tmp_path: Path
+) -> None:
+    configuration = quick(scheme)
+    trace = run_graph(configuration, tmp_path)
+    assert len(trace['time']) == configuration.ticks() == 4000
+    assert trace['recruitment_state'].max() == 2, 'the run must contain a shift'
+    assert_same_bits(trace, run_offline(configuration))
+
+
+def test_graph_equals_one_process_while_all_cores_are_busy(
+    quick: Callable[..., Configuration], both_cores_busy: None, tmp_path: Path
+) -> None:
+    configuration = quick('lag_pressure')
+    assert_same_bits(run_graph(configuration, tmp_path), run_offline(configuration))
+
+
+def test_graph_equals_one_process_with_sensor_noise_and_three_units(
+    quick: Callable[..., Configuration], tmp_path: Path
+) -> None:
+    configuration = quick(
+        'lag_pressure',
+        fam={'count': [1, 1, 2]},
+        sensors={'strain_noise': 1e-5, 'pressure_noise': 200.0, 'strain_resolution': 1e-6},
+    )
+    trace = run_graph(configuration, tmp_path)
+    assert trace['mu_pressure'].shape == (4000, 3)
+    assert np.unique(trace['recruitment_state']).size > 1, 'the run must contain a shift'
+    assert_same_bits(trace, run_offline(configuration))

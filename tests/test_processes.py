@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run owns its processes: a dead node ends it with its name, and nothing outlives it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from fam_bundle_bringup.graph import NODES
+from fam_bundle_io.trace import load_trace
+
+PATIENCE = 60.0  # s; only a hang takes that long
+
+
+def children(parent: int) -> dict[str, int]:
+    """Return the running nodes below a process by name, from the kernel's tables."""
+    found = {}
+    for entry in Path('/proc').iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            ppid = int((entry / 'stat').read_text().rsplit(')', 1)[1].split()[1])
+            words = (entry / 'cmdline').read_text().split('\0')
+        except OSError:
+            continue
+        for _, node in NODES:
+            if ppid == parent and any(word.endswith(f'/{node}') for word in words):
+                found[node] = int(entry.name)
+    return found
+
+
+@pytest.fixture
+def long_run(tmp_path: Path) -> 'subprocess.Popen[str]':
+    """Start an experiment that is in mid-run on return and would go on for long."""
+    command = [sys.executable, '-m', 'fam_bundle_bringup.cli', 'experiment', '--cycles', '1000']
+    run = subprocess.Popen(
+        [*command, '--out', str(tmp_path)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    log = tmp_path / 'log' / 'plant_simulator.log'
+    deadline = time.monotonic() + PATIENCE
+    while time.monotonic() < deadline and run.poll() is None:
+        if log.exists() and 'in lock-step' in log.read_text():
+            time.sleep(1.0)  # some ticks
+            return run
+        time.sleep(0.05)
+    run.kill()
+    raise AssertionError('the run did not start')
+
+
+def assert_gone(pids: dict[str, int]) -> None:
+    assert len(pids) == len(NODES)
+    for pid in pids.values():
+        assert not Path(f'/proc/{pid}').exists()
+
+
+@pytest.mark.parametrize('victim', [name for _, name in NODES])
+def test_killed_node_ends_the_run_with_its_name(
+    victim: str, long_run: 'subprocess.Popen[str]', tmp_path: Path
+) -> None:
+    nodes = children(long_run.pid)
+    os.kill(nodes[victim], signal.SIGKILL)
+    _, stderr = long_run.communicate(timeout=PATIENCE)
+    assert long_run.returncode == 1
+    assert victim in stderr
+    assert 'SIGKILL' in stderr
+    assert 'Traceback' not in stderr
+    trace = load_trace(tmp_path / 'trace.npz')
+    assert len(trace['time']) > 0
+    assert not (tmp_path / 'metrics.json').exists()
+    assert_gone(nodes)
+
+
+@pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
+def test_signal_ends_every_process(sent: int, long_run: 'subprocess.Popen[str]') -> None:
+    nodes = children(long_run.pid)
+    long_run.send_signal(sent)
+    _, stderr = long_run.communicate(timeout=PATIENCE)
+    assert long_run.returncode == 130
+    assert 'interrupted' in stderr
+    assert 'Traceback' not in stderr
+    assert_gone(nodes)
+
+
+def test_killed_runner_leaves_no_node_behind(long_run: 'subprocess.Popen[str]') -> None:
+    nodes = children(long_run.pid)
+    long_run.kill()
+    long_run.wait()
+    deadline = time.monotonic() + PATIENCE
+    while any(Path(f'/proc/{pid}').exists() for pid in nodes.values()):
+        assert time.monotonic() < deadline, 'nodes outlived their runner'
+        time.sleep(0.05)
