@@ -4,7 +4,7 @@
 A fit, not a validation: more free parameters than numbers. Bounds keep each parameter physical;
 objections keep the loop one that an engineer would accept: two shifts per cycle, no ripple in the
 pressures, an inner loop that follows its reference. Local least-squares searches from the given
-configuration and from random points around it. Run it with ``--help`` for what it takes.
+configuration and from random points around the best so far. Run it with ``--help`` for what it takes.
 """
 
 import argparse
@@ -140,14 +140,17 @@ def search(job: tuple[npt.NDArray[np.float64], argparse.Namespace]) -> tuple[flo
 
 
 def main() -> None:
-    """Search from the given configuration and from random points; write the best result."""
+    """Search around the given configuration, then around the best found; write the result."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--config', type=Path, required=True, help='configuration to start from')
     parser.add_argument('--out', type=Path, required=True, help='JSON file for the result')
     parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--starts', type=int, default=8, help='random starts beside the first')
-    parser.add_argument('--spread', type=float, default=0.4, help='of the starts, in log units')
-    parser.add_argument('--iterations', type=int, default=20, help='of each local search')
+    parser.add_argument('--rounds', type=int, default=2, help='each starts from the last best')
+    parser.add_argument('--starts', type=int, default=10, help='searches in each round')
+    parser.add_argument(
+        '--spread', type=float, default=0.4, help='of the starts in log units, halved each round'
+    )
+    parser.add_argument('--iterations', type=int, default=12, help='of each local search')
     parser.add_argument('--aim', type=float, default=0.03, help='relative error that costs 1')
     parser.add_argument('--workers', type=int, default=2)
     options = parser.parse_args()
@@ -157,16 +160,18 @@ def main() -> None:
         getattr(getattr(configuration, group), parameter)
         for group, parameter in (name.split('.') for name in BOUNDS)
     ]
-    first = np.log([float(v[0] if isinstance(v, tuple) else v) for v in known])
+    best = (np.inf, np.log([float(v[0] if isinstance(v, tuple) else v) for v in known]).tolist())
     generator = np.random.default_rng(options.seed)
-    spread = options.spread * generator.standard_normal((options.starts, len(first)))
-    jobs = [(first, options), *((first + offset, options) for offset in spread)]
-    best = (np.inf, first.tolist())
     with multiprocessing.Pool(options.workers) as pool:
-        for k, found in enumerate(pool.imap_unordered(search, jobs), 1):
-            best = min(best, found)
-            print(f'{k}/{len(jobs)} searches: cost {found[0]:.3f}, best {best[0]:.3f}', flush=True)
-            write(np.array(best[1]), options, best[0])
+        for k in range(options.rounds):
+            spread = options.spread / 2**k
+            offsets = spread * generator.standard_normal((options.starts, len(known)))
+            offsets[0] = 0.0
+            jobs = [(np.array(best[1]) + offset, options) for offset in offsets]
+            for found in pool.imap_unordered(search, jobs):
+                best = min(best, found)
+                print(f'round {k + 1}: cost {found[0]:.3f}, best {best[0]:.3f}', flush=True)
+                write(np.array(best[1]), options, best[0])
 
 
 def write(point: npt.NDArray[np.float64], options: argparse.Namespace, value: float) -> None:
@@ -175,6 +180,7 @@ def write(point: npt.NDArray[np.float64], options: argparse.Namespace, value: fl
     content = {
         'cost': value,
         'seed': options.seed,
+        'rounds': options.rounds,
         'starts': options.starts,
         'spread': options.spread,
         'iterations': options.iterations,

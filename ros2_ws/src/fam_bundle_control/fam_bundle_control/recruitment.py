@@ -79,7 +79,7 @@ def recruitment(configuration: Configuration) -> Recruitment:
 
 def recruitment_start() -> RecruitmentState:
     """Return the state before the first tick: one motor unit recruited."""
-    return RecruitmentState(1, 0.0, 0.0, 0.0, 0.0, False, False)
+    return RecruitmentState(1, 0.0, 0.0, 0.0, math.inf, False, False)
 
 
 @compiled
@@ -99,9 +99,9 @@ def compensating_pressure(
         unit = units[i]
         if mu_pressure[i] < fam.deslack_pressure(unit.fam, strain):
             pressure = max(mu_pressure[i], 0.0)
-            resistance -= unit.count * min(fam.force(unit.fam, pressure, strain), 0.0)
+            resistance -= unit.fams * min(fam.force(unit.fam, pressure, strain), 0.0)
         elif i < recruited:
-            stiffness += unit.count * fam.mesh_coefficient(unit.fam, strain)
+            stiffness += unit.fams * fam.mesh_coefficient(unit.fam, strain)
     return resistance / stiffness if stiffness > 0.0 else 0.0
 
 
@@ -143,34 +143,37 @@ def recruitment_step(
         rate = filtered(state.strain_rate, rate, law.strain_rate_time_constant, dt)
         load = filtered(state.force, force, law.force_time_constant, dt)
 
+    newest = recruited - 1
     next_unit = min(recruited, len(units) - 1)
     deslack = fam.deslack_pressure(units[next_unit].fam, strain)
     lag = look_up(table, next_unit, source_pressure, deslack)
     compensation = compensating_pressure(units, recruited, mu_pressure, strain)
+    if not law.pressure_compensation:
+        compensation = 0.0
 
     saturation = desaturation = math.inf
-    moving_up = rate > law.minimum_strain_rate
-    moving_down = rate < -law.minimum_strain_rate
-    margin = lag.drop + (compensation if law.pressure_compensation else 0.0)
-    effective = source_pressure - margin
-    if recruited < len(units) and moving_up:
+    if recruited < len(units) and rate > law.minimum_strain_rate:
+        effective = source_pressure - lag.drop - compensation
         limit = modelled_strain(units, recruited, effective, load)
         saturation = time_to_reach(limit, strain, rate)
-    if recruited > 1 and moving_down:
+    release = lag
+    if recruited > 1 and rate < -law.minimum_strain_rate:
+        newest_deslack = fam.deslack_pressure(units[newest].fam, strain)
+        release = look_up(table, newest, source_pressure, newest_deslack)
+        effective = source_pressure - release.drop - compensation
         limit = modelled_strain(units, recruited - 1, effective, load)
         desaturation = time_to_reach(limit, strain, rate)
 
-    newest = mu_pressure[recruited - 1]
     armed = state.armed
     if law.lag_compensation:
-        armed = armed or newest >= fam.deslack_pressure(units[recruited - 1].fam, strain)
+        armed = armed or mu_pressure[newest] >= fam.deslack_pressure(units[newest].fam, strain)
         # A lag of never: filling the next unit would take pressure and give nothing.
         up = saturation <= lag.lag and lag.lag < math.inf
-        down = desaturation <= -lag.lag
+        down = desaturation <= -release.lag
     else:
-        armed = armed or newest > law.downshift_pressure
+        armed = armed or mu_pressure[newest] > law.downshift_pressure
         up = recruited < len(units) and mu_pressure[0] >= law.upshift_pressure
-        down = newest <= law.downshift_pressure
+        down = mu_pressure[newest] <= law.downshift_pressure
     dwell = state.dwell + dt
     # A shift disturbs the very strain rate that the next decision rests on.
     if up and dwell >= law.minimum_dwell:
@@ -186,7 +189,7 @@ def recruitment_step(
         lag.drop,
         saturation,
         desaturation,
-        compensation if law.pressure_compensation else 0.0,
+        compensation,
         lag.outside,
     )
     return RecruitmentState(recruited, strain, rate, load, dwell, armed, True), output

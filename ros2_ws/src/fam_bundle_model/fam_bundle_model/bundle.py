@@ -12,15 +12,14 @@ from fam_bundle_model.fam import FamLaw, fam_law, value_of
 from fam_bundle_model.parameters import GRAVITY, Configuration
 from fam_bundle_model.schema import ConfigurationError
 
-LOWEST_STRAIN = -0.2  # the bracket of every search in strain
-HIGHEST_STRAIN = 0.5
+HIGHEST_STRAIN = 0.5  # the upper end of the search in strain
 TABLE_PRESSURE_RATIO = 2.0  # tables reach to this multiple of the nominal pressure
 
 
 class MotorUnit(NamedTuple):
-    """``count`` equal FAMs that share one valve."""
+    """Equal FAMs that share one valve: how many, and their law."""
 
-    count: float
+    fams: float
     fam: FamLaw
 
 
@@ -47,7 +46,7 @@ def bundle_force(
     """Return the bundle's force in N, each unit at its own pressure in Pa."""
     total = 0.0
     for i in range(len(units)):
-        total += units[i].count * fam.force(units[i].fam, pressures[i], strain)
+        total += units[i].fams * fam.force(units[i].fam, pressures[i], strain)
     return total
 
 
@@ -59,7 +58,7 @@ def state_force(
     total = 0.0
     for i in range(len(units)):
         applied = pressure if i < recruited else 0.0
-        total += units[i].count * fam.force(units[i].fam, applied, strain)
+        total += units[i].fams * fam.force(units[i].fam, applied, strain)
     return total
 
 
@@ -72,7 +71,9 @@ def modelled_strain(
     Inverse of ``state_force`` in strain by the Illinois variant of regula falsi; the ends of the
     bracket where the state is too strong or too weak anywhere.
     """
-    low, high = LOWEST_STRAIN, HIGHEST_STRAIN
+    low, high = -1.0, HIGHEST_STRAIN
+    for i in range(len(units)):
+        low = max(low, fam.lowest_strain(units[i].fam))
     at_low = state_force(units, recruited, pressure, low) - load
     at_high = state_force(units, recruited, pressure, high) - load
     if at_low <= 0.0:

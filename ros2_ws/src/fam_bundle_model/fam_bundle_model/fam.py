@@ -16,6 +16,7 @@ from fam_bundle_model.compile import compiled
 from fam_bundle_model.parameters import FamParameters
 
 TABLE_POINTS = 257
+VACUUM = -101325.0  # Pa gauge
 BISECTIONS = 56  # halves any bracket here to the last bits of a double
 LARGEST_STRAIN = 0.6  # beyond any strain at which a FAM still has a buckled shape
 
@@ -95,9 +96,15 @@ def deslack_pressure(law: FamLaw, strain: float) -> float:
 
 
 @compiled
+def lowest_strain(law: FamLaw) -> float:
+    """Return the strain of a FAM stretched to 95 % of what its braid allows (hoop stretch 0)."""
+    return -0.95 * (1.0 / math.sqrt(law.cos_squared) - 1.0)
+
+
+@compiled
 def free_strain(law: FamLaw, pressure: float) -> float:
     """Return the strain at which a FAM at ``pressure`` carries no force: inverse of equation 9."""
-    low, high = -0.5, LARGEST_STRAIN
+    low, high = lowest_strain(law), LARGEST_STRAIN
     strain = 0.1
     for _ in range(100):
         value = straight_force(law, pressure, strain)
@@ -126,7 +133,7 @@ def interpolate(
     """
     last = table.shape[0] - 1
     position = x / step
-    if position <= 0.0:
+    if position < 0.0:
         return table[0, column], 0.0
     if position >= last:
         return table[last, column], 0.0
@@ -177,14 +184,15 @@ def pressure_of(law: FamLaw, oil: float, strain: float, bulk_modulus: float) -> 
 
     Equation 7 in its conservative form ``oil = V(e_arc) exp(P / E)``. The larger of the taut
     pressure (``e_arc = e``) and the slack one (``e_arc = e_b(P)``) is the true one, since both
-    volumes grow with strain; so no region has to be chosen.
+    volumes grow with strain; so no region has to be chosen. Where both are below a vacuum, a
+    vapour cavity fills the rest.
     """
     taut = bulk_modulus * math.log(oil / volume(law, strain))
     if oil <= law.slack_volume:
         slack = bulk_modulus * math.log(oil / law.slack_volume)
     else:
         slack = interpolate(law.slack, 0, law.slack_step, oil - law.slack_volume)[0]
-    return max(taut, slack)
+    return max(taut, slack, VACUUM)
 
 
 @compiled

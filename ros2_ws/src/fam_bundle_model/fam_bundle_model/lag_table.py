@@ -9,6 +9,7 @@ source's largest loss until then.
 import math
 import os
 import tempfile
+import zipfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ import numpy.typing as npt
 
 from fam_bundle_model import fam
 from fam_bundle_model.bundle import MotorUnit, motor_units
-from fam_bundle_model.compile import cache_directory, compiled
+from fam_bundle_model.compile import cache_directory, compiled, source_digest
 from fam_bundle_model.hydraulics import (
     HydraulicLaw,
     hydraulic_law,
@@ -91,12 +92,12 @@ def fill_response(
         command = clamp(asked, -1.0, 1.0)
         for _ in range(substeps):
             flow = unit_flow(hydraulics, spool, source, pressure)
-            half_oil = oil + 0.5 * dt * flow / unit.count
+            half_oil = oil + 0.5 * dt * flow / unit.fams
             half_source = source + 0.5 * dt * source_pressure_rate(hydraulics, source, flow)
             half_spool = spool + 0.5 * dt * (command - spool) / hydraulics.spool_time_constant
             pressure = fam.pressure_of(unit.fam, half_oil, strain, hydraulics.bulk_modulus)
             flow = unit_flow(hydraulics, half_spool, half_source, pressure)
-            oil += dt * flow / unit.count
+            oil += dt * flow / unit.fams
             source += dt * source_pressure_rate(hydraulics, half_source, flow)
             spool += dt * (command - half_spool) / hydraulics.spool_time_constant
             pressure = fam.pressure_of(unit.fam, oil, strain, hydraulics.bulk_modulus)
@@ -151,7 +152,7 @@ def build_lag_table(configuration: Configuration) -> LagTable:
     lag, drop = np.empty(shape), np.empty(shape)
     first: dict[tuple[float, int], int] = {}
     for i, unit in enumerate(units):
-        same = first.setdefault((unit.count, id(unit.fam)), i)
+        same = first.setdefault((unit.fams, id(unit.fam)), i)
         if same == i:
             _fill_table(
                 hydraulic_law(configuration),
@@ -188,7 +189,8 @@ def look_up(table: LagTable, unit: int, source_pressure: float, deslack_pressure
     w10, w11 = u * (1.0 - v), u * v
     time = loss = 0.0
     for weight, a, b in ((w00, i, j), (w01, i, j + 1), (w10, i + 1, j), (w11, i + 1, j + 1)):
-        if weight > 0.0:
+        # Rounding must not let a neighbour that is never reached into a node of its own.
+        if weight > 1e-12:
             time += weight * lag[a, b]
             loss += weight * drop[a, b]
     return Lag(time, loss, left or up)
@@ -230,12 +232,12 @@ def lag_table_hash(configuration: Configuration) -> str:
 
 
 def cached_lag_table(configuration: Configuration) -> LagTable:
-    """Return the table of ``configuration``, kept on disk between calls."""
+    """Return the table of ``configuration``, kept on disk for these sources between calls."""
     parameters_hash = configuration.hash(*PHYSICS, 'lag_table')
-    path = cache_directory() / 'lag_tables' / f'{parameters_hash}.npz'
+    path = cache_directory() / f'lag_tables-{source_digest()}' / f'{parameters_hash}.npz'
     try:
         return load_lag_table(path, parameters_hash)
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         table = build_lag_table(configuration)
         save_lag_table(table, parameters_hash, path)
         return table

@@ -148,7 +148,7 @@ class RecruitmentParameters:
     strain_rate_time_constant: float = positive('s', 'filter of the strain rate')
     force_time_constant: float = positive('s', 'filter of the measured force')
     minimum_strain_rate: float = positive('1/s', 'slower is taken as standing still')
-    minimum_dwell: float = number('s', 'least time in a state before a downshift', minimum=0.0)
+    minimum_dwell: float = number('s', 'least time between two shifts', minimum=0.0)
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,7 @@ def make_configuration(
     """
     for name in values:
         if name not in GROUPS:
-            raise ConfigurationError(unknown(name, list(GROUPS)))
+            raise ConfigurationError(unknown(str(name), list(GROUPS)))
         if not isinstance(values[name], Mapping):
             raise ConfigurationError(f'{name} = {values[name]}: must be a group of parameters')
     groups: dict[str, Any] = dict.fromkeys(GROUPS)
@@ -271,6 +271,8 @@ def make_configuration(
     configuration = Configuration(**groups)
     if configuration.fam is not None:
         check_fam(configuration.fam)
+    if configuration.recruitment is not None:
+        check_recruitment(configuration.recruitment)
     return configuration
 
 
@@ -286,6 +288,15 @@ def check_fam(fam: FamParameters) -> None:
             raise ConfigurationError(
                 f'fam.{name}: {len(value)} values for {units} motor units; must be 1 or {units}'
             )
+
+
+def check_recruitment(recruitment: RecruitmentParameters) -> None:
+    """Raise ConfigurationError where a unit would be released as soon as it is recruited."""
+    if recruitment.downshift_threshold >= recruitment.upshift_threshold:
+        raise ConfigurationError(
+            f'recruitment.downshift_threshold = {recruitment.downshift_threshold:g}: must be < '
+            f'recruitment.upshift_threshold = {recruitment.upshift_threshold:g}'
+        )
 
 
 def read_yaml(path: Path) -> dict[str, dict[str, Any]]:

@@ -68,7 +68,7 @@ class Declaration:
         try:
             # YAML 1.1 reads 4.9e7 as text, so text that is a number counts as one.
             number = math.nan if isinstance(value, bool) else float(value)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise refused from None
         below = number <= self.minimum if self.exclusive else number < self.minimum
         if not math.isfinite(number) or below or number > self.maximum:

@@ -77,7 +77,7 @@ def run_node(make_node: Callable[[], LoopNode]) -> int:
     try:
         node = make_node()
     except ConfigurationError as error:
-        print(f'{error}', file=sys.stderr)
+        print(f'{error} (parameters: --ros-args --params-file FILE)', file=sys.stderr)
         rclpy.try_shutdown()
         return 2
     executor = make_executor()

@@ -89,11 +89,11 @@ def derivative(
         unit = rig.units[i]
         oil, spool = state[UNITS + i], state[UNITS + count + i]
         pressure = fam.pressure_of(unit.fam, oil, strain, rig.hydraulics.bulk_modulus)
-        force += unit.count * fam.force(unit.fam, pressure, strain)
+        force += unit.fams * fam.force(unit.fam, pressure, strain)
         flow = unit_flow(rig.hydraulics, spool, source, pressure)
         if spool > 0.0:
             drawn += flow
-        rate[UNITS + i] = flow / unit.count
+        rate[UNITS + i] = flow / unit.fams
         rate[UNITS + count + i] = (command[i] - spool) / rig.hydraulics.spool_time_constant
     friction = rig.friction_force * math.tanh(speed / rig.friction_rate)
     length = rig.units[0].fam.length
@@ -145,7 +145,7 @@ def truth(
         mu_pressure[i] = fam.pressure_of(
             unit.fam, state[UNITS + i], strain, rig.hydraulics.bulk_modulus
         )
-        force += unit.count * fam.force(unit.fam, mu_pressure[i], strain)
+        force += unit.fams * fam.force(unit.fam, mu_pressure[i], strain)
         if spool > 0.0:
             flow += unit_flow(rig.hydraulics, spool, source, mu_pressure[i])
     return Truth(strain, force, source, flow)

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compiled and interpreted controllers give the same bits over a run of random measurements.
+
+This file runs itself a second time with FAM_BUNDLE_INTERPRET=1 and compares every number.
+"""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from fam_bundle_control.pressure_loop import pressure_loop_step
+from fam_bundle_control.recruitment import recruitment, recruitment_start, recruitment_step
+from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
+from fam_bundle_model import compile
+from fam_bundle_model.bundle import motor_units
+from fam_bundle_model.lag_table import LagTable
+from fam_bundle_model.parameters import load_configuration
+from fam_bundle_model.pressure_pi import pressure_gains
+
+CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
+
+
+def evaluate():
+    """Return the bits of each tick's outputs, by scheme and law."""
+    configuration = load_configuration(CONFIGURATION)
+    units, dt = motor_units(configuration), 1e-3
+    random = np.random.default_rng(5)
+    axis = np.linspace(0.0, 7e5, 6)
+    table = LagTable(axis, axis, random.random((2, 6, 6)), 1e5 * random.random((2, 6, 6)))
+    found = {}
+    for scheme in ('baseline', 'lag_pressure'):
+        part = dataclasses.replace(configuration.recruitment, scheme=scheme)
+        policy = recruitment(dataclasses.replace(configuration, recruitment=part))
+        outer, gains = strain_loop(configuration), pressure_gains(configuration.pressure_loop)
+        state, outer_state = recruitment_start(), strain_loop_start()
+        integral, references, spool = np.zeros((3, 2))
+        saturated = np.zeros(2, dtype=bool)
+        rows = []
+        for k in range(1500):
+            strain = 0.06 * (1.0 - np.cos(k / 240.0)) + 1e-5 * random.standard_normal()
+            pressures = random.uniform(0.0, 6.5e5, 2)
+            force, source = random.uniform(150.0, 220.0), random.uniform(5e5, 6.9e5)
+            outer_state, asked = strain_loop_step(
+                outer, outer_state, strain + 1e-3, strain, source, pressures[0], dt
+            )
+            state, decided = recruitment_step(
+                policy, units, table, state, strain, force, source, pressures, dt
+            )
+            pressure_loop_step(
+                gains,
+                integral,
+                decided.recruited,
+                asked.pressure,
+                decided.pressure_compensation,
+                source,
+                pressures,
+                dt,
+                references,
+                spool,
+                saturated,
+            )
+            rows.append([*asked, *decided, *state, *integral, *references, *spool, *saturated])
+        found[scheme] = [np.array(r, dtype=float).tobytes().hex() for r in rows]
+        found[scheme + ' states'] = sorted({r[3] for r in rows})
+    return found
+
+
+def test_compiled_and_interpreted_controllers_give_the_same_bits(tmp_path):
+    environment = {**os.environ, 'FAM_BUNDLE_INTERPRET': '1'}
+    environment['PYTHONPATH'] = os.pathsep.join(filter(None, sys.path))
+    path = tmp_path / 'bits.json'
+    subprocess.run([sys.executable, __file__, str(path)], env=environment, check=True, timeout=300)
+    interpreted = json.loads(path.read_text())
+    assert interpreted.pop('compiled') is False
+    compiled = evaluate()
+    assert compiled['lag_pressure states'] == compiled['baseline states'] == [1, 2]
+    assert compiled == interpreted
+
+
+if __name__ == '__main__':
+    numbers = {**evaluate(), 'compiled': compile._DECORATOR is not None}
+    Path(sys.argv[1]).write_text(json.dumps(numbers))
