@@ -75,7 +75,7 @@ def draw_figures(
         'figure_13_lag_pressure': figures.run_figure(
             traces['lag_pressure'], titles['lag_pressure']
         ),
-        'figure_14_comparison': figures.comparison_figure(traces),
+        'figure_14_comparison': figures.comparison_figure({name: traces[name] for name in PAPER}),
         'force_surface': figures.surface_figure(configuration),
         'lag_table': figures.lag_table_figure(cached_lag_table(configuration)),
     }

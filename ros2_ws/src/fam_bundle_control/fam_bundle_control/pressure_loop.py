@@ -14,7 +14,7 @@ def is_compensated(unit: int, recruited: int) -> bool:
 
     A single recruited unit is compensated against the slack ones itself.
     """
-    return unit < max(recruited - 1, 1)
+    return unit < recruited and unit < max(recruited - 1, 1)
 
 
 @compiled

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fam_bundle_control.pressure_loop import is_compensated
 from fam_bundle_model import fam
 from fam_bundle_model.bundle import MotorUnit, modelled_strain
 from fam_bundle_model.compile import compiled
@@ -92,7 +93,7 @@ def compensating_pressure(
     """Return P_comp in Pa of equations 10 and 11 at the measured pressures and strain.
 
     The resistance of every unit below its de-slack pressure, over the force per pressure of the
-    recruited units that are above theirs. Zero where none is slack, or none could help.
+    compensated units that are above theirs. Zero where none is slack, or none could help.
     """
     resistance = stiffness = 0.0
     for i in range(len(units)):
@@ -100,7 +101,7 @@ def compensating_pressure(
         if mu_pressure[i] < fam.deslack_pressure(unit.fam, strain):
             pressure = max(mu_pressure[i], 0.0)
             resistance -= unit.fams * min(fam.force(unit.fam, pressure, strain), 0.0)
-        elif i < recruited:
+        elif is_compensated(i, recruited):
             stiffness += unit.fams * fam.mesh_coefficient(unit.fam, strain)
     return resistance / stiffness if stiffness > 0.0 else 0.0
 

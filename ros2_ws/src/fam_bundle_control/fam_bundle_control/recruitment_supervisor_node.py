@@ -47,7 +47,11 @@ class RecruitmentSupervisor(LoopNode):
             )
             return
         first = self.table is None
-        self.table = from_message(message)
+        try:
+            self.table = from_message(message)
+        except ValueError as error:
+            self.fail(f'lag_table: its parts do not fit together ({error})')
+            return
         if first:
             self.decide(0.0, 0.0, 0.0, np.zeros(len(self.units)), 1.0)  # compiles the law
             self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state)

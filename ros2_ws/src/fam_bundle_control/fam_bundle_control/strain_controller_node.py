@@ -9,7 +9,7 @@ from fam_bundle_model.parameters import seconds
 from fam_bundle_msgs.msg import BundleState, PressureReference
 from fam_bundle_node.loop_node import LoopNode, run_node
 from fam_bundle_node.stamps import StampClock
-from fam_bundle_node.ticks import check_finite
+from fam_bundle_node.ticks import check_finite, check_length
 
 
 class StrainController(LoopNode):
@@ -17,7 +17,9 @@ class StrainController(LoopNode):
 
     def __init__(self) -> None:
         """Compile the law before the first tick needs it."""
-        super().__init__('strain_controller', ('strain_loop', 'source', 'reference', 'simulation'))
+        super().__init__(
+            'strain_controller', ('fam', 'strain_loop', 'source', 'reference', 'simulation')
+        )
         self.law = strain_loop(self.configuration)
         self.state = strain_loop_start()
         self.clock = StampClock(self.configuration.period_ns())
@@ -27,6 +29,8 @@ class StrainController(LoopNode):
 
     def on_bundle_state(self, seen: BundleState) -> None:
         """Answer one tick."""
+        units = len(self.configuration.fam.count)
+        check_length('bundle_state', seen.tick, seen.mu_pressure, units)
         measured = (seen.strain, seen.source_pressure, *seen.mu_pressure)
         check_finite('bundle_state', seen.tick, measured)
         dt = self.clock.since_last(seen.header.stamp)

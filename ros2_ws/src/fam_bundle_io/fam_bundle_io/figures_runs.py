@@ -276,16 +276,16 @@ def _draw_prediction(
         (low - 0.06 * height, found.time_to_limit, rf'$t_\mathrm{{{symbol}}}$', colour),
         (low - 0.2 * height, found.lag, r'$t_\mathrm{lag}$', LAG),
     ):
-        ends = (found.time, found.time + length)
+        start_end = (found.time, found.time + length)
         axes.annotate(
             '',
-            (ends[1], level),
-            (ends[0], level),
+            (start_end[1], level),
+            (start_end[0], level),
             arrowprops={'arrowstyle': '->', 'color': shade, 'shrinkA': 0, 'shrinkB': 0},
         )
         axes.annotate(
             f'{name} = {length:.3f} s',
-            (max(ends), level),
+            (max(start_end), level),
             (5, 0),
             textcoords='offset points',
             color=shade,

@@ -43,10 +43,13 @@ class Declaration:
             return 'must be one of ' + ', '.join(self.choices)
         bounds = []
         if self.minimum > -math.inf:
-            bounds.append(f'{">" if self.exclusive else ">="} {self.minimum:g}')
+            bounds.append(f'{">" if self.exclusive else ">="} {self._plain(self.minimum)}')
         if self.maximum < math.inf:
-            bounds.append(f'<= {self.maximum:g}')
+            bounds.append(f'<= {self._plain(self.maximum)}')
         return 'must be ' + (' and '.join(bounds) if bounds else 'a finite number')
+
+    def _plain(self, bound: float) -> str:
+        return str(int(bound)) if self.kind is int else f'{bound:g}'
 
     def convert(self, name: str, value: Any) -> Any:
         """Return ``value`` as the declared type, or raise ConfigurationError."""
