@@ -109,10 +109,12 @@ def recording() -> Iterator[tuple['TraceRecorder', Callable[[float], None]]]:
     from fam_bundle_node.loop_node import make_executor
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    recorder, executor, never = TraceRecorder(), make_executor(), Future()
+    executor.add_node(recorder)
     try:
-        recorder, never = TraceRecorder(), Future()
-        executor = make_executor()
-        executor.add_node(recorder)
         yield recorder, lambda wait: executor.spin_until_future_complete(never, timeout_sec=wait)
     finally:
+        # Else its subscriptions live on and hold the next run up.
+        executor.shutdown()
+        recorder.destroy_node()
         rclpy.try_shutdown()

@@ -6,8 +6,10 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from fam_bundle_io.figures_style import (
     KILOPASCAL,
@@ -33,6 +35,8 @@ from fam_bundle_model.pressure_pi import pressure_gains
 TARGET = 0.8  # of the nominal pressure: the paper's example of a de-slack pressure
 POINTS = 5000  # of all traces together under the source's line
 ISOBARS = 6
+# Ends before its yellow, on which white contours would be lost.
+MAP = ListedColormap(colormaps['cividis'](np.linspace(0.0, 0.85, 256)))
 
 
 @styled
@@ -57,16 +61,20 @@ def response_figure(configuration: Configuration) -> Figure:
     time, source, pressure = rows[:, 0], KILOPASCAL * rows[:, 1], KILOPASCAL * rows[:, 2]
     stop = min(2.0 * lag, limit)
     axes.plot(time, source, label='source', **SOURCE)
-    axes.plot(time, pressure, label=f'MU{unit + 1}', **unit_style(unit))
+    axes.plot(time, pressure, label=f'MU{unit + 1}', color=unit_style(unit)['color'])
     axes.axhline(
-        KILOPASCAL * target, color='#000000', linestyle='--', linewidth=1.0, label='de-slack'
+        KILOPASCAL * target,
+        color='#000000',
+        linestyle='--',
+        linewidth=1.0,
+        label='de-slack pressure',
     )
     axes.axhline(
         KILOPASCAL * REACHED * target,
         color='#000000',
         linestyle=':',
         linewidth=1.0,
-        label=f'{REACHED:.0%} of it',
+        label=f'{100.0 * REACHED:.0f} % of it',
     )
     axes.set_title(
         f'source {KILOPASCAL * nominal:.1f} kPa, de-slack pressure {KILOPASCAL * target:.1f} kPa'
@@ -135,10 +143,10 @@ def source_figure(configuration: Configuration, traces: Mapping[str, Trace]) -> 
             KILOPASCAL * pressure[::every],
             linestyle='none',
             marker='.',
-            markersize=3,
+            markersize=5,
             markeredgewidth=0,
             color='#0072B2',
-            alpha=0.35,
+            alpha=0.4,
             rasterized=True,
             label=f'runs, every {every}th tick' if every > 1 else 'runs, every tick',
         )
@@ -147,14 +155,14 @@ def source_figure(configuration: Configuration, traces: Mapping[str, Trace]) -> 
         LITRES_PER_MINUTE * ends,
         KILOPASCAL * (nominal - droop * ends),
         color='#000000',
-        label='settled',
+        label='source, settled',
     )
     slope = KILOPASCAL * droop / LITRES_PER_MINUTE
     axes.set_title(f'nominal {KILOPASCAL * nominal:.1f} kPa, droop {slope:.1f} kPa per L/min')
     axes.set_xlim(-0.02 * LITRES_PER_MINUTE * largest, LITRES_PER_MINUTE * ends[1])
     axes.set_xlabel('source flow (L/min)')
     axes.set_ylabel('source pressure (kPa)')
-    axes.legend(loc='upper right')
+    axes.legend(loc='lower left')
     return figure
 
 
@@ -168,7 +176,7 @@ def surface_figure(configuration: Configuration) -> Figure:
     nominal = configuration.source.nominal_pressure
     law = motor_units(configuration)[0].fam
     pressures = np.linspace(0.0, nominal, ISOBARS)
-    farthest = fam.free_strain(law, nominal) + 0.03
+    farthest = min(_bounds(law, nominal)[1] + 0.02, fam.LARGEST_STRAIN)
     figure = Figure(figsize=(7.2, 3.9))
     whole, near = figure.subplots(1, 2)
     weakest = 0.0
@@ -200,14 +208,20 @@ def surface_figure(configuration: Configuration) -> Figure:
 
 def _regions(law: FamLaw, pressure: float, farthest: float) -> list[tuple[Array, str]]:
     """Return the strains of each region at ``pressure`` Pa up to ``farthest``, and its line."""
-    buckling, _ = fam.interpolate(law.compression, 0, law.pressure_step, pressure)
-    collapse, _ = fam.interpolate(law.compression, 2, law.pressure_step, pressure)
-    bounds = np.minimum([0.0, max(buckling, 0.0), max(collapse, 0.0), farthest], farthest)
+    buckling, collapse = _bounds(law, pressure)
+    bounds = np.clip([0.0, buckling, collapse, farthest], 0.0, farthest).tolist()
     return [
         (np.linspace(low, high, 200), linestyle)
         for low, high, linestyle in zip(bounds[:-1], bounds[1:], ('-', '--', ':'), strict=True)
         if high > low
     ]
+
+
+def _bounds(law: FamLaw, pressure: float) -> tuple[float, float]:
+    """Return the strains at which a FAM at ``pressure`` Pa buckles and collapses."""
+    buckling, _ = fam.interpolate(law.compression, 0, law.pressure_step, pressure)
+    collapse, _ = fam.interpolate(law.compression, 2, law.pressure_step, pressure)
+    return buckling, collapse
 
 
 @styled
@@ -234,9 +248,10 @@ def lag_table_figure(table: LagTable) -> Figure:
             (right, KILOPASCAL * table.drop[row[0]], 'source pressure drop (kPa)'),
         ):
             _draw_map(figure, axes, table, np.where(never, np.nan, values), label)
-            axes.set_title(names)
+            if never.any():
+                axes.text(0.97, 0.06, 'never', transform=axes.transAxes, ha='right')
             axes.set_xlabel('de-slack pressure (kPa)')
-        left.set_ylabel('source pressure (kPa)')
+        left.set_ylabel(f'{names}: source pressure (kPa)')
     return figure
 
 
@@ -244,7 +259,8 @@ def _draw_map(figure: Figure, axes: Axes, table: LagTable, values: Array, label:
     x, y = KILOPASCAL * table.deslack_pressure, KILOPASCAL * table.source_pressure
     axes.set_facecolor('#c8c8c8')
     axes.grid(False)
-    filled = axes.pcolormesh(x, y, values, cmap='cividis', shading='nearest', rasterized=True)
-    lines = axes.contour(x, y, values, levels=6, colors='#ffffff', linewidths=0.7)
+    filled = axes.pcolormesh(x, y, values, cmap=MAP, shading='nearest', rasterized=True)
+    levels = MaxNLocator(6).tick_values(0.0, float(np.nanmax(values)))[1:]
+    lines = axes.contour(x, y, values, levels=levels, colors='#ffffff', linewidths=0.7)
     axes.clabel(lines, fontsize=7)
     figure.colorbar(filled, ax=axes, label=label, location='top', aspect=30)

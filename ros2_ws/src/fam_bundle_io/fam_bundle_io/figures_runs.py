@@ -63,7 +63,7 @@ def run_figure(trace: Trace, title: str) -> Figure:
     panels = list(
         figure.subplots(len(heights), 1, sharex=True, gridspec_kw={'height_ratios': heights})
     )
-    figure.suptitle(title)
+    figure.suptitle(title, x=0.01, horizontalalignment='left')
     time = signal(trace, 'time')[window]
     _draw_tracking(panels[0], trace, window)
     if predicted:
@@ -97,7 +97,7 @@ def _draw_tracking(axes: Axes, trace: Trace, window: slice) -> None:
 def _draw_predictions(axes: Axes, trace: Trace, window: slice) -> None:
     time = signal(trace, 'time')[window]
     lag = signal(trace, 'recruitment_lag')[window]
-    axes.plot(time, lag, color=LAG, label='recruitment\nlag')
+    axes.plot(time, lag, color=LAG, label='recruitment lag')
     for name, colour, label in (
         ('time_to_saturation', UPSHIFT, 'to saturation'),
         ('time_to_desaturation', DOWNSHIFT, 'to desaturation'),
@@ -121,15 +121,16 @@ def _draw_state(axes: Axes, trace: Trace, window: slice) -> None:
     )
     axes.set_yticks(range(1, units + 1))
     axes.set_ylim(0.7, units + 0.3)
-    axes.set_ylabel('state')
+    axes.set_ylabel('recruitment\nstate')
 
 
 def _draw_pressures(axes: Axes, trace: Trace, window: slice) -> None:
     time = signal(trace, 'time')[window]
     source = KILOPASCAL * signal(trace, 'source_pressure')[window]
     axes.plot(time, source, label='source', **SOURCE)
-    for unit, pressure in enumerate(signal(trace, 'mu_pressure')[window].T):
-        axes.plot(time, KILOPASCAL * pressure, label=f'MU{unit + 1}', **unit_style(unit))
+    pressures = KILOPASCAL * signal(trace, 'mu_pressure')[window].T
+    for unit, pressure in enumerate(pressures):
+        axes.plot(time, pressure, label=f'MU{unit + 1}', **unit_style(unit))
     axes.set_ylabel('pressure (kPa)')
     legend_beside(axes)
 
@@ -162,14 +163,19 @@ def comparison_figure(traces: Mapping[str, Trace]) -> Figure:
             at_shift = np.interp(ups[0], time, strain)
             near.plot(ups[0] - start, at_shift, marker='^', markersize=6, color=style['color'])
     near.set_ylabel('strain (%)')
+    near.set_xlabel('time from the start of the cycle (s)')
+    length = max(time[-1] for time, _ in shown)
     if firsts:
-        length = max(time[-1] for time, _ in shown)
+        near.plot([], [], '^', markersize=6, color='#777777', label='upshift')
         _zoom(near, shown, min(firsts) - 0.03 * length, max(firsts) + 0.15 * length)
+        near.set_title('around the upshift')
     else:
+        near.set_xlim(0.0, length)
         near.set_title('no upshift in this cycle')
+    whole.set_title('whole cycle')
     legend_beside(near)
     whole.axhline(0.0, color='#999999', linewidth=0.7, zorder=1.0)
-    whole.set_xlim(0.0, max(time[-1] for time, _ in shown))
+    whole.set_xlim(0.0, length)
     whole.set_ylabel('error (% strain)')
     whole.set_xlabel('time from the start of the cycle (s)')
     return figure
@@ -184,7 +190,10 @@ def _zoom(axes: Axes, curves: list[tuple[Array, Array]], start: float, stop: flo
 
 
 class Prediction(NamedTuple):
-    """One tick's prediction: time (s), strain, strain rate (1/s), lag (s), time to limit (s)."""
+    """One tick's prediction: time (s), strain, strain rate (1/s), lag (s), time to limit (s).
+
+    The lag is infinite where the next unit would never be filled.
+    """
 
     time: float
     strain: float
@@ -220,7 +229,7 @@ def prediction_before(
         float(time[at]),
         float(strain[at]),
         rate,
-        float(signal(trace, 'recruitment_lag')[at]),
+        float(trace['recruitment_lag'][at]),
         float(signal(trace, name)[at]),
     )
 
@@ -245,7 +254,7 @@ def prediction_figure(trace: Trace, configuration: Configuration) -> Figure:
             axes.text(0.5, 0.5, reason, transform=axes.transAxes, ha='center', va='center')
             axes.set_axis_off()
         else:
-            axes.set_title(f'before the {word} at {times[-1]:.3f} s', pad=42.0)
+            axes.set_title(f'before the {word} at {times[-1]:.3f} s', pad=24.0)
             _draw_prediction(axes, trace, found, times[-1], symbol, colour)
     return figure
 
@@ -254,12 +263,13 @@ def _draw_prediction(
     axes: Axes, trace: Trace, found: Prediction, shift: float, symbol: str, colour: str
 ) -> None:
     reach = found.time + found.time_to_limit
-    span = max(shift, reach, found.time + found.lag) - min(found.time, reach)
+    filled = found.time + found.lag if np.isfinite(found.lag) else found.time
+    span = max(shift, reach, filled) - min(found.time, reach)
     start, stop = min(found.time, reach) - 0.35 * span, max(shift, reach) + 0.35 * span
     time, strain = signal(trace, 'time'), PERCENT * signal(trace, 'strain')
     window = (time >= start) & (time <= stop)
     axes.plot(time[window], strain[window], label='measured', **MEASURED)
-    ends = np.array([min(found.time, reach), max(found.time, reach) + 0.15 * span])
+    ends = np.array([min(found.time, reach), max(filled, reach)])
     expected = PERCENT * (found.strain + found.rate * (ends - found.time))
     axes.plot(ends, expected, color='#000000', linestyle='-.', linewidth=1.0, label='$E(t)$')
     limit = PERCENT * found.limit()
@@ -271,29 +281,28 @@ def _draw_prediction(
     low, high = axes.get_ylim()
     height = high - low
     # Two arrows below all curves; how long they are against each other decides the shift.
-    axes.set_ylim(low - 0.3 * height, high)
-    for level, length, name, shade in (
-        (low - 0.06 * height, found.time_to_limit, rf'$t_\mathrm{{{symbol}}}$', colour),
-        (low - 0.2 * height, found.lag, r'$t_\mathrm{lag}$', LAG),
+    axes.set_ylim(low - 0.42 * height, high)
+    for level, end, length, name, shade in (
+        (low - 0.16 * height, reach, found.time_to_limit, rf'$t_\mathrm{{{symbol}}}$', colour),
+        (low - 0.36 * height, filled, found.lag, r'$t_\mathrm{lag}$', LAG),
     ):
-        start_end = (found.time, found.time + length)
+        if np.isfinite(length):
+            said = f'{name} = {length:.3f} s'.replace('-', '\N{MINUS SIGN}')
+            arrow = {'arrowstyle': '->', 'color': shade, 'shrinkA': 0, 'shrinkB': 0}
+            axes.annotate('', (end, level), (found.time, level), arrowprops=arrow, zorder=4.0)
+        else:
+            said = f'{name}: never'
         axes.annotate(
-            '',
-            (start_end[1], level),
-            (start_end[0], level),
-            arrowprops={'arrowstyle': '->', 'color': shade, 'shrinkA': 0, 'shrinkB': 0},
-        )
-        axes.annotate(
-            f'{name} = {length:.3f} s',
-            (max(start_end), level),
-            (5, 0),
+            said,
+            (min(found.time, end), level),
+            (3, 5),
             textcoords='offset points',
             color=shade,
-            va='center',
+            bbox={'facecolor': 'white', 'edgecolor': 'none', 'pad': 0.5},
         )
     axes.vlines(
-        found.time, low - 0.26 * height, PERCENT * found.strain, colors='#999999', linewidths=0.7
+        found.time, low - 0.42 * height, PERCENT * found.strain, colors='#999999', linewidths=0.7
     )
     axes.set_xlabel('time (s)')
     axes.set_ylabel('strain (%)')
-    legend_above(axes, 2)
+    legend_above(axes, 3)

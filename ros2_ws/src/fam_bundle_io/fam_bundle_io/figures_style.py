@@ -36,8 +36,11 @@ LINE_STYLES = ('-', '--', '-.', ':')
 
 def unit_style(unit: int) -> dict[str, Any]:
     """Return the line of motor unit ``unit`` (0 is the first recruited) in every figure."""
-    turn, colour = divmod(unit, len(UNIT_COLOURS))
-    return {'color': UNIT_COLOURS[colour], 'linestyle': LINE_STYLES[turn % len(LINE_STYLES)]}
+    # Recruited units share one pressure: the lines below show through the gaps of those above.
+    return {
+        'color': UNIT_COLOURS[unit % len(UNIT_COLOURS)],
+        'linestyle': LINE_STYLES[unit % len(LINE_STYLES)],
+    }
 
 
 def scheme_style(position: int) -> dict[str, Any]:
@@ -81,7 +84,7 @@ def legend_beside(axes: Axes, **options: Any) -> None:
 
 def legend_above(axes: Axes, columns: int) -> None:
     """Put the legend above ``axes`` in ``columns`` columns, where it hides nothing."""
-    axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncol=columns, columnspacing=1.2)
+    axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncol=columns, columnspacing=1.0)
 
 
 @styled

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every node of the loop shares: parameters, start-up, errors, executor and exit status."""
 
+import contextlib
+import gc
+import os
 import sys
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -71,8 +74,19 @@ def make_executor() -> Executor:
     return EventsExecutor()
 
 
+def ask_for_batch_scheduling() -> None:
+    """Let nobody that this process wakes pre-empt it: a fifth more ticks per second in lock-step.
+
+    Else a publisher is put aside by its first reader before it has served the others. Threads
+    made later inherit it; it needs no rights. Does nothing where the system has no such policy.
+    """
+    with contextlib.suppress(AttributeError, OSError):
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
 def run_node(make_node: Callable[[], LoopNode]) -> int:
     """Run a node until it is done or told to stop, and return its exit status."""
+    ask_for_batch_scheduling()
     rclpy.init()
     try:
         node = make_node()
@@ -82,6 +96,8 @@ def run_node(make_node: Callable[[], LoopNode]) -> int:
         return 2
     executor = make_executor()
     executor.add_node(node)
+    gc.collect()
+    gc.freeze()  # numba leaves half a million objects that no later collection need look at
     try:
         # A finite wait: an unbounded one answers no signal with the events executor.
         while rclpy.ok() and not node.done.done():
