@@ -7,7 +7,11 @@ from collections.abc import Mapping
 import pytest
 
 from fam_bundle_bringup.demo import PAPER
-from fam_bundle_bringup.experiment import default_configuration, measure_tracking
+from fam_bundle_bringup.experiment import (
+    checked_configuration,
+    default_configuration,
+    measure_tracking,
+)
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.metrics import Tracking, shift_times
 from fam_bundle_io.trace import Trace
@@ -71,13 +75,15 @@ def test_halving_the_substep_changes_no_strain(scheme: str) -> None:
     assert abs(run_offline(finer)['strain'] - trace['strain']).max() < 1e-4
 
 
-@pytest.mark.parametrize('counts', [[4], [1, 1, 2], [1] * 16])
-def test_any_number_of_motor_units_runs(counts: list[int]) -> None:
-    total = sum(counts) / 4.0
-    configuration = load_configuration(
+@pytest.mark.parametrize(
+    ('counts', 'mass', 'highest'), [([4], 18.8, 1), ([1, 1, 2], 18.8, 3), ([1] * 16, 30.0, 3)]
+)
+def test_any_number_of_motor_units_runs(counts: list[int], mass: float, highest: int) -> None:
+    configuration = checked_configuration(
         default_configuration(),
-        {'fam': {'count': counts}, 'load': {'mass': 18.8 * total}, 'reference': {'cycles': 1}},
+        {'fam': {'count': counts}, 'load': {'mass': mass}, 'reference': {'cycles': 1}},
     )
     trace = run_offline(configuration)
     assert trace['mu_pressure'].shape == (configuration.ticks(), len(counts))
+    assert trace['recruitment_state'].max() >= highest
     assert abs(trace['strain_reference'] - trace['strain']).max() < 0.08

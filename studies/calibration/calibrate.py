@@ -4,7 +4,7 @@
 A fit, not a validation: more free parameters than numbers. Bounds keep each parameter physical;
 objections keep the loop one that an engineer would accept: two shifts per cycle, no ripple in the
 pressures, an inner loop that follows its reference. Local least-squares searches from the given
-configuration and from random points around the best so far. Run it with ``--help`` for what it takes.
+configuration and from random points around the best so far. ``--help`` lists what it takes.
 """
 
 import argparse
