@@ -5,7 +5,6 @@ import importlib.metadata
 import json
 import os
 import platform
-import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +14,7 @@ from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.metrics import Tracking, shift_times, tracking
 from fam_bundle_io.trace import Trace, save_trace
 from fam_bundle_model.bundle import check_reachable, motor_units
+from fam_bundle_model.files import whole_file
 from fam_bundle_model.parameters import Configuration, load_configuration, write_yaml
 from fam_bundle_model.schema import ConfigurationError
 
@@ -91,12 +91,8 @@ def metrics_of(configuration: Configuration, pace: str, trace: Trace) -> dict[st
 
 def write_json(content: Any, path: Path) -> None:
     """Write ``content`` as JSON; whole or not at all."""
-    with tempfile.NamedTemporaryFile(
-        'w', dir=path.parent, suffix='.tmp', delete=False, encoding='utf-8'
-    ) as file:
-        json.dump(content, file, indent=1)
-        file.write('\n')
-    os.replace(file.name, path)
+    with whole_file(path) as file:
+        file.write(json.dumps(content, indent=1).encode() + b'\n')
 
 
 def prepare_folder(folder: Path) -> None:

@@ -2,7 +2,6 @@
 """What all figures share: style, colours, windows of a trace, and the files."""
 
 import io
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fam_bundle_io.trace import Trace
+from fam_bundle_model.files import whole_file
 
 Array = npt.NDArray[np.float64]
 
@@ -102,10 +102,6 @@ def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
             contents[folder / f'{name}.{suffix}'] = buffer.getvalue()
     folder.mkdir(parents=True, exist_ok=True)
     for path, content in contents.items():
-        unfinished = path.with_name(f'{path.name}.tmp')
-        try:
-            unfinished.write_bytes(content)
-            os.replace(unfinished, path)
-        finally:
-            unfinished.unlink(missing_ok=True)
+        with whole_file(path) as file:
+            file.write(content)
     return list(contents)

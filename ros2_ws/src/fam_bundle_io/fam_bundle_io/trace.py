@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The trace of a run: one array per signal, one row per tick; SI units."""
 
-import os
-import tempfile
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
+
+from fam_bundle_model.files import whole_file
 
 Trace = dict[str, npt.NDArray[Any]]
 
@@ -42,9 +42,8 @@ def empty_trace(ticks: int, units: int) -> Trace:
 
 def save_trace(trace: Trace, path: Path) -> None:
     """Write ``trace`` as an ``npz`` file; whole or not at all."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix='.tmp', delete=False) as file:
+    with whole_file(path) as file:
         np.savez(file, **cast(Any, trace))
-    os.replace(file.name, path)
 
 
 def load_trace(path: Path) -> Trace:

@@ -7,8 +7,6 @@ source's largest loss until then.
 """
 
 import math
-import os
-import tempfile
 import zipfile
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +17,7 @@ import numpy.typing as npt
 from fam_bundle_model import fam
 from fam_bundle_model.bundle import MotorUnit, motor_units
 from fam_bundle_model.compile import cache_directory, compiled, source_digest
+from fam_bundle_model.files import whole_file
 from fam_bundle_model.hydraulics import (
     HydraulicLaw,
     hydraulic_law,
@@ -209,9 +208,8 @@ def _cell(axis: npt.NDArray[np.float64], x: float) -> tuple[int, float, bool]:
 def save_lag_table(table: LagTable, parameters_hash: str, path: Path) -> None:
     """Write ``table`` with the hash of the parameters it was built from; whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix='.tmp', delete=False) as file:
+    with whole_file(path) as file:
         np.savez(file, parameters_hash=np.array(parameters_hash), **table._asdict())
-    os.replace(file.name, path)
 
 
 def load_lag_table(path: Path, parameters_hash: str) -> LagTable:

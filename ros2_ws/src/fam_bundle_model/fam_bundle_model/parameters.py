@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fam_bundle_model.files import whole_file
 from fam_bundle_model.schema import (
     ConfigurationError,
     choice,
@@ -355,4 +356,5 @@ def write_yaml(configuration: Configuration, path: Path) -> None:
         for group, content in dataclasses.asdict(configuration).items()
     }
     text = yaml.safe_dump({'/**': {'ros__parameters': values}}, sort_keys=False)
-    Path(path).write_text(text, encoding='utf-8')
+    with whole_file(path) as file:
+        file.write(text.encode())
