@@ -74,6 +74,7 @@ def test_written_parameters_give_the_same_run_again(fam: Fam, tmp_path: Path) ->
         (('--reference', 'square'), ('reference.kind', 'square', 'sine')),
         (('--config', '/does/not/exist.yaml'), ('/does/not/exist.yaml', 'No such file')),
         (('--bogus',), ('--bogus',)),
+        (('--cycles', '100000'), ('reference.cycles', '100000', '<= 2000')),
     ],
 )
 def test_bad_argument_is_refused_in_one_line(
@@ -111,6 +112,32 @@ def test_bad_configuration_is_refused_in_one_line(
     arguments = ['experiment', '--pace', 'offline', '--config', str(config), '--out', str(out)]
     assert_refused(arguments, words, capsys)
     assert not out.exists()
+
+
+def test_diverging_plant_is_an_error_and_keeps_what_was_good(
+    capsys: Capture, tmp_path: Path
+) -> None:
+    content = yaml.safe_load(default_configuration().read_text())
+    content['/**']['ros__parameters']['valve']['spool_time_constant'] = 1e-5
+    config, out = tmp_path / 'stiff.yaml', tmp_path / 'out'
+    config.write_text(yaml.safe_dump(content))
+    arguments = ['experiment', '--pace', 'offline', *QUICK, '--config', str(config)]
+    assert main([*arguments, '--out', str(out)]) == 1
+    message = capsys.readouterr().err
+    assert 'is not finite' in message
+    assert 'simulation.substeps' in message
+    assert not (out / 'metrics.json').exists()
+    for values in load_trace(out / 'trace.npz').values():
+        assert not np.isnan(values).any()
+
+
+def test_own_parameters_are_not_overwritten(capsys: Capture, tmp_path: Path) -> None:
+    config = tmp_path / 'parameters.yaml'
+    config.write_text(default_configuration().read_text())
+    before = config.read_bytes()
+    arguments = ['experiment', '--pace', 'offline', '--config', str(config), '--out']
+    assert_refused([*arguments, str(tmp_path)], ('would overwrite',), capsys)
+    assert config.read_bytes() == before
 
 
 def test_out_that_is_a_file_is_refused(capsys: Capture, tmp_path: Path) -> None:

@@ -314,6 +314,13 @@ def test_relative_links_lead_somewhere(document: Path) -> None:
     assert not broken
 
 
+@pytest.mark.parametrize('document', ['README.md', 'docs', 'studies'])
+def test_no_placeholder_is_left(document):
+    path = ROOT / document
+    for text in [path] if path.is_file() else path.rglob('*.md'):
+        assert not re.search(r'@[A-Z]+@', text.read_text()), text
+
+
 if __name__ == '__main__':
     for group_name, parameters in GROUPS.items():
         print(f'### {group_name}\n\n{" ".join(parameters.__doc__.split())}\n')

@@ -157,6 +157,23 @@ def test_bad_parameter_is_refused_in_one_line(
     assert 'must be' in stderr
 
 
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (('-p', 'strain_loop.tracking_tim:=0.1'), ('tracking_tim', 'strain_loop.tracking_time')),
+        (('--params-file', '/does/not/exist.yaml'), ('/does/not/exist.yaml',)),
+    ],
+)
+def test_node_refuses_what_it_does_not_know(
+    arguments: tuple[str, ...], words: tuple[str, ...], start: Callable[..., Any]
+) -> None:
+    process = start('fam_bundle_control', 'strain_controller', *arguments)
+    _, stderr = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 2
+    assert stderr.count('\n') == 1, stderr
+    assert all(word in stderr for word in words)
+
+
 def test_controller_answers_and_refuses_bad_data(client: Node, start: Callable[..., Any]) -> None:
     process = start('fam_bundle_control', 'strain_controller')
     answers: list[PressureReference] = []
@@ -170,6 +187,7 @@ def test_controller_answers_and_refuses_bad_data(client: Node, start: Callable[.
     assert answers[0].tick == 5
     assert answers[0].pressure == pytest.approx(2e5), 'the loop starts without a bump'
     state.tick, state.strain = 6, float('nan')
+    state.header.stamp.nanosec = 1_000_000
     publisher.publish(state)
     _, stderr = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1

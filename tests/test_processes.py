@@ -78,6 +78,16 @@ def test_killed_node_ends_the_run_with_its_name(
     assert_gone(nodes)
 
 
+def test_plant_that_is_told_to_stop_has_not_finished(
+    long_run: 'subprocess.Popen[str]', tmp_path: Path
+) -> None:
+    os.kill(children(long_run.pid)['plant_simulator'], signal.SIGTERM)
+    _, stderr = long_run.communicate(timeout=PATIENCE)
+    assert long_run.returncode == 1
+    assert 'plant_simulator ended with exit status 130' in stderr
+    assert len(load_trace(tmp_path / 'trace.npz')['time']) > 0
+
+
 @pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
 def test_signal_ends_every_process(sent: int, long_run: 'subprocess.Popen[str]') -> None:
     nodes = children(long_run.pid)

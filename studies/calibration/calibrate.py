@@ -16,18 +16,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from fam_bundle_bringup.demo import PAPER
+from fam_bundle_bringup.experiment import measure_tracking
 from fam_bundle_bringup.offline import run_offline
-from fam_bundle_io.metrics import shift_times, tracking
+from fam_bundle_io.metrics import shift_times
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.lag_table import build_lag_table
 from fam_bundle_model.parameters import load_configuration
 from fam_bundle_model.schema import ConfigurationError
-
-PAPER = {
-    'baseline': (0.0454, 0.0223),
-    'lag': (0.0234, 0.0075),
-    'lag_pressure': (0.0211, 0.0064),
-}
 
 # Parameter: lowest, highest; searched on a logarithmic scale.
 BOUNDS = {
@@ -98,10 +94,9 @@ def evaluate(config: Path, changes: dict[str, dict[str, Any]]) -> dict[str, Any]
         changes['recruitment'] = {**changes.get('recruitment', {}), 'scheme': scheme}
         configuration = load_configuration(config, changes)
         trace = run_offline(configuration, table=table)
-        cycle = 1.0 / configuration.reference.frequency
-        cycles = configuration.reference.cycles
-        found = tracking(trace, (cycles - 1) * cycle, cycles * cycle)
-        result[scheme] = {**found._asdict(), 'objections': objections(trace, cycles, cycle)}
+        cycles, start = configuration.reference.cycles, 1.0 / configuration.reference.frequency
+        found = measure_tracking(configuration, trace)
+        result[scheme] = {**found._asdict(), 'objections': objections(trace, cycles, start)}
     return result
 
 

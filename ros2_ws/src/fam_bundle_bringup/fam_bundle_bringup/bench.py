@@ -56,7 +56,10 @@ def lockstep_ticks_per_second(configuration: Configuration) -> float:
 
 
 def first_tick_seconds(configuration: Configuration) -> float:
-    """Return the time from the start of the command line to the plant's first tick."""
+    """Return the time from the start of the Python command line to the plant's first tick.
+
+    ``./fam`` itself takes a few tenths of a second before that.
+    """
     with tempfile.TemporaryDirectory() as name:
         config, out = Path(name) / 'parameters.yaml', Path(name) / 'out'
         write_yaml(configuration, config)
@@ -111,7 +114,13 @@ def run_bench(configuration: Configuration, folder: Path) -> None:
                 progress(done)
     medians = {name: statistics.median(found) for name, found in values.items()}
     spread = {name: [min(found), max(found)] for name, found in values.items()}
-    content = {**medians, 'spread': spread, 'cores': os.cpu_count(), 'versions': versions()}
+    content = {
+        **medians,
+        'spread': spread,
+        'values': values,
+        'cores': os.cpu_count(),
+        'versions': versions(),
+    }
     write_json(content, folder / 'bench.json')
     for name, median in medians.items():
         low, high = spread[name]

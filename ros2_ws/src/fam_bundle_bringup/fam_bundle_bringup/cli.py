@@ -11,6 +11,7 @@ from typing import Any
 
 from fam_bundle_bringup.experiment import (
     PACES,
+    RESULTS,
     checked_configuration,
     default_configuration,
     prepare_folder,
@@ -124,9 +125,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Every exit unwinds, so that no process is left behind.
     signal.signal(signal.SIGTERM, _terminate)
     try:
+        results = RESULTS if options.command == 'experiment' else ()
         changes = changes_of(options) if options.command == 'experiment' else {}
-        configuration = checked_configuration(options.config or default_configuration(), changes)
-        prepare_folder(options.out)
+        config = options.config or default_configuration()
+        configuration = checked_configuration(config, changes)
+        if config.resolve() == (options.out / 'parameters.yaml').resolve():
+            raise ConfigurationError(f'--out {options.out}: would overwrite {config}')
+        prepare_folder(options.out, results)
         if options.command == 'experiment':
             run_experiment_command(options, configuration)
         elif options.command == 'demo':
@@ -143,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f'fam {options.command}: interrupted', file=sys.stderr)
         return 130
-    except RuntimeError as error:
+    except (RuntimeError, OSError) as error:
         print(f'fam {options.command}: {error}', file=sys.stderr)
         return 1
     return 0

@@ -23,21 +23,24 @@ PAPER = {
 def run_demo(configuration: Configuration, folder: Path) -> None:
     """Run every scheme through the graph, print Table 2 and write all results to ``folder``.
 
-    Raises GraphFailed when a node ends early.
+    Raises RunFailed when a run ends early.
     """
+    for name in ('table2.json', 'shapes.json'):  # no numbers of an earlier call beside new ones
+        (folder / name).unlink(missing_ok=True)
     results: dict[str, Result] = {}
     for scheme in SCHEMES:
         recruitment = dataclasses.replace(configuration.recruitment, scheme=scheme)
         one = dataclasses.replace(configuration, recruitment=recruitment)
         with progress_bar(f'{scheme}, through the graph', one.ticks()) as progress:
             results[scheme] = run_experiment(one, 'lockstep', folder / scheme, progress)
-    with progress_bar('threshold by hindsight, offline', len(THRESHOLDS)) as progress:
-        rival = best_threshold(configuration, progress)
-    tuned = with_threshold(configuration, rival.threshold)
-    run_experiment(tuned, 'offline', folder / 'baseline_hindsight')
     tracked = {scheme: _tracking(result) for scheme, result in results.items()}
     table = {scheme: tracked[scheme]._asdict() for scheme in PAPER}
     write_json(table, folder / 'table2.json')
+    with progress_bar('threshold by hindsight, offline', len(THRESHOLDS)) as progress:
+        rival = best_threshold(configuration, progress)
+    if rival is not None:
+        tuned = with_threshold(configuration, rival.threshold)
+        run_experiment(tuned, 'offline', folder / 'baseline_hindsight')
     traces = {scheme: result.trace for scheme, result in results.items()}
     claims = paper_claims(configuration, traces)
     write_json([claim._asdict() for claim in claims], folder / 'shapes.json')
@@ -82,7 +85,7 @@ def draw_figures(
     return figures.save_figures(drawn, folder)
 
 
-def print_table(tracked: Mapping[str, Tracking], rival: Rival) -> None:
+def print_table(tracked: Mapping[str, Tracking], rival: Rival | None) -> None:
     """Print the paper's Table 2 beside ours, and the rival tuned by hindsight."""
     from rich.console import Console
     from rich.table import Table
@@ -93,10 +96,10 @@ def print_table(tracked: Mapping[str, Tracking], rival: Rival) -> None:
         table.add_column(heading, justify='right')
     for scheme, found in tracked.items():
         table.add_row(scheme, *_cells(found, PAPER.get(scheme)))
-    table.add_section()
-    table.add_row(
-        f'baseline at {rival.threshold:.0%}, by hindsight', *_cells(rival.tracking, None)
-    )
+    if rival is not None:
+        table.add_section()
+        name = f'baseline at {rival.threshold:.0%}, by hindsight'
+        table.add_row(name, *_cells(rival.tracking, None))
     console = Console()
     console.print(table)
     ours = _reductions(tracked)
@@ -105,10 +108,13 @@ def print_table(tracked: Mapping[str, Tracking], rival: Rival) -> None:
         f'lag_pressure against baseline: IAE {ours.iae:+.0%} (paper {paper.iae:+.0%}), '
         f'maximum {ours.max_error:+.0%} (paper {paper.max_error:+.0%}).'
     )
-    console.print(
-        'The last row is the best fixed threshold for this very reference, found by trying '
-        f'{THRESHOLDS[0]:.0%} to {THRESHOLDS[-1]:.0%}; it has to be known in advance.'
-    )
+    if rival is None:
+        console.print('No fixed threshold tracks this reference without chatter.')
+    else:
+        console.print(
+            'The last row is the best fixed threshold for this very reference, found by trying '
+            f'{THRESHOLDS[0]:.0%} to {THRESHOLDS[-1]:.0%}; it has to be known in advance.'
+        )
 
 
 def _cells(found: Tracking, paper: Tracking | None) -> list[str]:

@@ -5,11 +5,12 @@ import importlib.metadata
 import json
 import os
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fam_bundle_bringup.graph import GraphFailed, run_graph
+from fam_bundle_bringup.failure import RunFailed
+from fam_bundle_bringup.graph import run_graph
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.metrics import Tracking, shift_times, tracking
 from fam_bundle_io.trace import Trace, save_trace
@@ -20,6 +21,7 @@ from fam_bundle_model.schema import ConfigurationError
 
 PACES = ('lockstep', 'offline')
 RESULTS = ('metrics.json', 'trace.npz')
+LARGEST_RUN = 20_000_000  # ticks that a trace in memory can hold
 
 
 class Result(NamedTuple):
@@ -45,6 +47,17 @@ def checked_configuration(
     """
     configuration = load_configuration(path, changes)
     check_reachable(configuration, motor_units(configuration))
+    ticks, cycles = configuration.ticks(), configuration.reference.cycles
+    if ticks < 2 * cycles:
+        raise ConfigurationError(
+            f'simulation.period = {configuration.simulation.period:g} s: must be <= '
+            f'{0.5 / configuration.reference.frequency:g} s, half a cycle of the reference'
+        )
+    if ticks > LARGEST_RUN:
+        raise ConfigurationError(
+            f'reference.cycles = {cycles}: must be <= {LARGEST_RUN * cycles // ticks}, for a '
+            f'trace holds at most {LARGEST_RUN} ticks'
+        )
     return configuration
 
 
@@ -92,17 +105,17 @@ def metrics_of(configuration: Configuration, pace: str, trace: Trace) -> dict[st
 def write_json(content: Any, path: Path) -> None:
     """Write ``content`` as JSON; whole or not at all."""
     with whole_file(path) as file:
-        file.write(json.dumps(content, indent=1).encode() + b'\n')
+        file.write(json.dumps(content, indent=1, allow_nan=False).encode() + b'\n')
 
 
-def prepare_folder(folder: Path) -> None:
-    """Make ``folder`` and take away the results of an earlier run in it.
+def prepare_folder(folder: Path, results: Iterable[str]) -> None:
+    """Make ``folder`` and take away ``results`` of an earlier call in it.
 
     Raises ConfigurationError when it cannot be written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name in RESULTS:
+        for name in results:
             (folder / name).unlink(missing_ok=True)
     except OSError as error:
         raise ConfigurationError(f'--out {folder}: cannot be written ({error.strerror})') from None
@@ -118,19 +131,19 @@ def run_experiment(
 ) -> Result:
     """Run ``configuration`` and write its parameters, trace and metrics to ``folder``.
 
-    Raises ConfigurationError when ``folder`` cannot be written, and GraphFailed when a node ends
-    early; the trace of the ticks until then is kept.
+    Raises ConfigurationError when ``folder`` cannot be written, and RunFailed when the run
+    ends early; the trace of the ticks until then is kept.
     """
-    prepare_folder(folder)
-    if pace == 'offline':
-        write_yaml(configuration, folder / 'parameters.yaml')
-        trace = run_offline(configuration, progress)
-    else:
-        try:
+    prepare_folder(folder, RESULTS)
+    write_yaml(configuration, folder / 'parameters.yaml')
+    try:
+        if pace == 'offline':
+            trace = run_offline(configuration, progress)
+        else:
             trace = run_graph(configuration, folder, progress)
-        except GraphFailed as error:
-            save_trace(error.trace, folder / 'trace.npz')
-            raise
+    except RunFailed as error:
+        save_trace(error.trace, folder / 'trace.npz')
+        raise
     save_trace(trace, folder / 'trace.npz')
     metrics = metrics_of(configuration, pace, trace)
     write_json(metrics, folder / 'metrics.json')

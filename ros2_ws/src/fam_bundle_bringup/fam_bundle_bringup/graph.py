@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_bringup.processes import NodeDied, NodeGroup, executable
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration, write_yaml
@@ -25,15 +26,6 @@ NODES = (
 LOOP_LISTENERS = 3  # strain controller, supervisor, pressure controller
 SLICE = 0.05  # s of listening between two looks at the processes
 DRAIN_TIMEOUT = 10.0  # s for the last messages after the plant has ended
-
-
-class GraphFailed(RuntimeError):
-    """A run that ended early; ``trace`` holds the ticks that were recorded until then."""
-
-    def __init__(self, message: str, trace: Trace) -> None:
-        """Keep the trace beside the message."""
-        super().__init__(message)
-        self.trace = trace
 
 
 @contextlib.contextmanager
@@ -69,27 +61,31 @@ def run_graph(
     """Run ``configuration`` through the graph and return its trace.
 
     The nodes' parameter file and what they print go to ``folder``. ``progress`` is called with
-    the ticks done so far. Raises GraphFailed when a node ends early or messages stay missing.
+    the ticks done so far. Raises RunFailed when a node ends early or messages stay missing.
     """
     parameter_file = folder / 'parameters.yaml'
     write_yaml(configuration, parameter_file)
     units, ticks = len(configuration.fam.count), configuration.ticks()
-    with own_domain(), recording() as (recorder, listen), nodes_in(folder) as group:
-        start_nodes(group, parameter_file, LOOP_LISTENERS + 1)
-        try:
-            while not group.finished('plant_simulator'):
-                listen(SLICE)
-                if progress is not None:
-                    progress(recorder.ticks())
-            drained = time.monotonic() + DRAIN_TIMEOUT
-            while recorder.complete_ticks() < ticks and time.monotonic() < drained:
-                listen(SLICE)
-        except NodeDied as error:
-            raise GraphFailed(str(error), recorder.trace(units)) from None
-    trace = recorder.trace(units)
+    failure = None
+    with own_domain(), recording() as (recorder, listen):
+        with nodes_in(folder) as group:
+            start_nodes(group, parameter_file, LOOP_LISTENERS + 1)
+            try:
+                while not group.finished('plant_simulator'):
+                    listen(SLICE)
+                    if progress is not None:
+                        progress(recorder.ticks())
+                drained = time.monotonic() + DRAIN_TIMEOUT
+                while recorder.complete_ticks() < ticks and time.monotonic() < drained:
+                    listen(SLICE)
+            except NodeDied as error:
+                failure = str(error)
+        trace = recorder.trace(units)
     recorded = len(trace['time'])
-    if recorded < ticks:
-        raise GraphFailed(f'{ticks - recorded} of {ticks} ticks did not reach the trace', trace)
+    if failure is None and recorded < ticks:
+        failure = f'tick {recorded} of {ticks} did not reach the trace on every topic'
+    if failure is not None:
+        raise RunFailed(f'{failure} ({recorded} ticks are kept)', trace)
     return trace
 
 

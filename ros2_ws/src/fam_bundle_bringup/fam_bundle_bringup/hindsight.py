@@ -41,15 +41,16 @@ def chatters(configuration: Configuration, trace: Trace) -> bool:
 
 def best_threshold(
     configuration: Configuration, progress: Callable[[int], None] | None = None
-) -> Rival:
-    """Return the threshold with the least IAE among those that do not chatter.
+) -> Rival | None:
+    """Return the threshold with the least IAE among those that do not chatter, if there is one.
 
-    The runs are offline. ``progress`` is called with the thresholds tried so far. Raises
-    RuntimeError when every threshold chatters.
+    The runs are offline. ``progress`` is called with the thresholds tried so far.
     """
     table = cached_lag_table(configuration)
     best: Rival | None = None
     for k, threshold in enumerate(THRESHOLDS, 1):
+        if threshold <= configuration.recruitment.downshift_threshold:
+            continue
         tried = with_threshold(configuration, threshold)
         trace = run_offline(tried, table=table)
         found = measure_tracking(tried, trace)
@@ -58,6 +59,4 @@ def best_threshold(
             best = Rival(threshold, found)
         if progress is not None:
             progress(k)
-    if best is None:
-        raise RuntimeError('every threshold chatters on this reference')
     return best

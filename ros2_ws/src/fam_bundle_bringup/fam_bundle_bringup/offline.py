@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_control.pressure_loop import pressure_loop_step
 from fam_bundle_control.recruitment import (
     Recruitment,
@@ -138,7 +139,7 @@ def run_offline(
     """Return the trace of the whole run of ``configuration``.
 
     ``progress`` is called with the ticks done so far; ``table`` spares the look-up of the lag
-    table where the caller has it already.
+    table where the caller has it already. Raises RunFailed when the plant diverges.
     """
     units, ticks = len(configuration.fam.count), configuration.ticks()
     simulation, step = configuration.simulation, configuration.period_ns()
@@ -179,6 +180,22 @@ def run_offline(
         )
         for column, name in enumerate(COLUMNS):
             trace[name][block] = rows[:, column]
+        _check_finite(trace, block)
         if progress is not None:
             progress(block.stop)
     return trace
+
+
+def _check_finite(trace: Trace, block: slice) -> None:
+    """Raise RunFailed at the first tick whose measurements or commands are not finite."""
+    for name in ('strain', 'force', 'source_pressure', 'mu_pressure', 'spool'):
+        values = trace[name][block].reshape(block.stop - block.start, -1)
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if bad.size:
+            tick = block.start + int(bad[0])
+            kept = {signal: column[:tick] for signal, column in trace.items()}
+            raise RunFailed(
+                f'{name}: tick {tick} is not finite; the plant diverges, try more '
+                f'simulation.substeps ({tick} ticks are kept)',
+                kept,
+            )

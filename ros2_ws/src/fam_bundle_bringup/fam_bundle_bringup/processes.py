@@ -26,10 +26,14 @@ class NodeProcess(NamedTuple):
     log: Path
 
 
+# Found here, for between fork and exec nothing may be loaded.
+_PRCTL = ctypes.CDLL(None).prctl
+_SET_PARENT_DEATH_SIGNAL = 1
+
+
 def _end_with_parent() -> None:
     # Linux: a node must not outlive a runner that was killed itself.
-    set_parent_death_signal = 1
-    ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGKILL)
+    _PRCTL(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
 
 
 class NodeGroup:

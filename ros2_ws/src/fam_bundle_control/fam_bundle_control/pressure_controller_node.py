@@ -12,7 +12,7 @@ from fam_bundle_model.pressure_pi import pressure_gains
 from fam_bundle_msgs.msg import BundleState, PressureReference, RecruitmentState, ValveCommand
 from fam_bundle_node.loop_node import LoopNode, run_node
 from fam_bundle_node.stamps import StampClock
-from fam_bundle_node.ticks import TickJoin, check_finite, check_length
+from fam_bundle_node.ticks import TickError, TickJoin, check_finite, check_length
 
 TOPICS = ('bundle_state', 'pressure_reference', 'recruitment_state')
 
@@ -82,6 +82,11 @@ class PressureController(LoopNode):
         check_finite('bundle_state', seen.tick, (seen.source_pressure, *seen.mu_pressure))
         check_finite('pressure_reference', seen.tick, (reference.pressure,))
         compensation = recruitment.pressure_compensation
+        if not 1 <= recruitment.recruited <= len(self.spool):
+            raise TickError(
+                f'recruitment_state: tick {seen.tick} holds {recruitment.recruited} recruited; '
+                f'must be from 1 to {len(self.spool)}'
+            )
         check_finite('recruitment_state', seen.tick, (compensation,))
         self.command(
             recruitment.recruited,

@@ -21,7 +21,7 @@ def tracking(trace: Trace, start: float, stop: float) -> Tracking:
     Raises ValueError when the trace has fewer than two ticks in that window.
     """
     time = trace['time']
-    window = (time >= start - 1e-9) & (time < stop + 1e-9)
+    window = (time >= start - 1e-9) & (time < stop - 1e-9)
     if np.count_nonzero(window) < 2:
         raise ValueError(f'the trace has no ticks from {start:g} s to {stop:g} s')
     error = np.abs(trace['strain_reference'] - trace['strain'])[window]

@@ -51,7 +51,7 @@ class _Run(NamedTuple):
         return float(np.abs(self.error()[self.after()]).max())
 
     def overshoot(self) -> float:
-        return float(-self.error()[self.up : self.down].min())
+        return float(-self.error()[self.up : self.down + 1].min())
 
     def saturation_after(self) -> float:
         """Return the share of the ticks after the upshift at which MU1 is at the source."""

@@ -71,7 +71,7 @@ def fill_response(
     strain = fam.free_strain(unit.fam, target)
     oil = fam.oil_of(unit.fam, 0.0, strain, hydraulics.bulk_modulus)
     source = hydraulics.nominal_pressure
-    spool = integral = lowest = 0.0
+    spool = integral = 0.0
     lowest = source
     lag = math.inf
     dt = period / substeps

@@ -208,6 +208,9 @@ class RunParameters:
     listeners: int = integer(
         'subscriptions of bundle_state to wait for before tick 0', 1, 100, default=3
     )
+    start_timeout: float = positive(
+        's', 'wall time without these subscriptions that ends the plant simulator', default=300.0
+    )
     answer_timeout: float = positive(
         's', 'wall time without the answer to a tick that ends a lock-step run', default=20.0
     )

@@ -8,7 +8,7 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
 from fam_bundle_model.parameters import GROUPS, Configuration, make_configuration
-from fam_bundle_model.schema import Declaration, declarations
+from fam_bundle_model.schema import ConfigurationError, Declaration, declarations, unknown
 
 
 def declare_configuration(node: Node, groups: Iterable[str]) -> Configuration:
@@ -24,6 +24,11 @@ def declare_configuration(node: Node, groups: Iterable[str]) -> Configuration:
             value = _declare(node, f'{group}.{name}', declaration)
             if value is not None:
                 given[name] = value
+    for name in node._parameter_overrides:
+        group, _, field = name.partition('.')
+        if group in names and field not in declarations(GROUPS[group]):
+            known = [f'{group}.{k}' for k in declarations(GROUPS[group])]
+            raise ConfigurationError(unknown(name, known))
     return make_configuration(values, names)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.task import Future
@@ -19,6 +20,8 @@ from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.declare import declare_configuration
 from fam_bundle_node.qos import LOOP_PUBLISHER, LOOP_SUBSCRIPTION
 from fam_bundle_node.ticks import TickError, TickOrder
+
+INTERRUPTED = 130
 
 
 class LoopNode(Node):
@@ -85,9 +88,17 @@ def ask_for_batch_scheduling() -> None:
 
 
 def run_node(make_node: Callable[[], LoopNode]) -> int:
-    """Run a node until it is done or told to stop, and return its exit status."""
+    """Run a node until it is done or told to stop, and return its exit status.
+
+    0 when it has done its work, 1 after a failure, 2 for a bad configuration, 130 when it was told
+    to stop before.
+    """
     ask_for_batch_scheduling()
-    rclpy.init()
+    try:
+        rclpy.init()
+    except rclpy_implementation.RCLError as error:  # a parameter file that is missing or no YAML
+        print(' '.join(str(error).split()), file=sys.stderr)
+        return 2
     try:
         node = make_node()
     except ConfigurationError as error:
@@ -104,6 +115,6 @@ def run_node(make_node: Callable[[], LoopNode]) -> int:
             executor.spin_until_future_complete(node.done, timeout_sec=1.0)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    status = node.done.result() if node.done.done() else 0
+    status = node.done.result() if node.done.done() else INTERRUPTED
     rclpy.try_shutdown()
     return status

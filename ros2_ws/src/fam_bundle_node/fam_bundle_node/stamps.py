@@ -4,6 +4,7 @@
 from typing import Protocol
 
 from fam_bundle_model.parameters import seconds
+from fam_bundle_node.ticks import TickError
 
 
 class Stamp(Protocol):
@@ -22,8 +23,10 @@ class StampClock:
         self._last_ns: int | None = None
 
     def since_last(self, stamp: Stamp) -> float:
-        """Return the time in s since the stamp before."""
+        """Return the time in s since the stamp before; raises TickError when time stands still."""
         now_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
         last_ns = now_ns - self._first_step_ns if self._last_ns is None else self._last_ns
+        if now_ns <= last_ns:
+            raise TickError(f'stamp {now_ns} ns does not follow stamp {last_ns} ns')
         self._last_ns = now_ns
         return seconds(now_ns - last_ns)

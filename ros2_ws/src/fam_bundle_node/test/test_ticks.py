@@ -62,6 +62,13 @@ def test_wrong_number_of_units_is_refused() -> None:
         check_length('bundle_state', 3, (1.0,), 2)
 
 
+def test_time_that_stands_still_is_refused() -> None:
+    clock = StampClock(1_000_000)
+    clock.since_last(SimpleNamespace(sec=1, nanosec=0))
+    with pytest.raises(TickError, match='does not follow'):
+        clock.since_last(SimpleNamespace(sec=1, nanosec=0))
+
+
 def test_time_steps_come_from_stamps() -> None:
     clock = StampClock(1_000_000)
     stamps = [SimpleNamespace(sec=s, nanosec=n) for s, n in ((5, 999_000_000), (6, 0), (6, 500))]

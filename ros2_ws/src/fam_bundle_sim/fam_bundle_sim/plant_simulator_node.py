@@ -5,6 +5,7 @@ import sys
 import time
 
 import numpy as np
+from rclpy.duration import Duration
 
 from fam_bundle_model.parameters import seconds
 from fam_bundle_msgs.msg import BundleState, ValveCommand
@@ -26,6 +27,7 @@ GROUPS = (
     'run',
 )
 
+LAST_MESSAGES = Duration(seconds=5)
 MATCHING_PERIOD = 0.02  # s between two looks at who listens
 
 
@@ -55,7 +57,11 @@ class PlantSimulator(LoopNode):
 
     def start(self) -> None:
         """Publish tick 0 once everybody listens, and begin to watch for answers."""
-        if self.publisher.get_subscription_count() < self.configuration.run.listeners:
+        present, wanted = self.publisher.get_subscription_count(), self.configuration.run.listeners
+        if present < wanted:
+            timeout = self.configuration.run.start_timeout
+            if time.monotonic() - self.started_at > timeout:
+                self.fail(f'bundle_state: {present} of {wanted} listeners after {timeout:g} s')
             return
         self.timer.cancel()
         self.get_logger().info(f'running {self.ticks} ticks in lock-step')
@@ -92,6 +98,7 @@ class PlantSimulator(LoopNode):
         if self.tick == self.ticks:
             elapsed = time.monotonic() - self.started_at
             self.get_logger().info(f'ran {self.ticks} ticks in {elapsed:.4f} s')
+            self.publisher.wait_for_all_acked(LAST_MESSAGES)  # a recorder may be behind
             self.succeed()
             return
         self.advance(self.state, np.clip(command.spool, -1.0, 1.0))

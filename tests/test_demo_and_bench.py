@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo and the benchmark write what they promise, on a short reference."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fam_bundle_bringup import bench, demo, hindsight
+from fam_bundle_bringup.offline import run_offline
+from fam_bundle_io.shapes import paper_claims
+from fam_bundle_io.trace import Trace
+from fam_bundle_model.parameters import SCHEMES, Configuration
+
+FIGURES = {
+    'figure_06_response',
+    'figure_07_prediction',
+    'figure_10_source',
+    'figure_11_baseline',
+    'figure_12_lag',
+    'figure_13_lag_pressure',
+    'figure_14_comparison',
+    'force_surface',
+    'lag_table',
+}
+
+
+def test_demo_writes_all_its_results(
+    quick: Callable[..., Configuration],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(hindsight, 'THRESHOLDS', (0.4, 0.6, 0.7))
+    demo.run_demo(quick(), tmp_path)
+    table = json.loads((tmp_path / 'table2.json').read_text())
+    assert set(table) == set(demo.PAPER)
+    for scheme in SCHEMES:
+        metrics = json.loads((tmp_path / scheme / 'metrics.json').read_text())
+        assert metrics['scheme'] == scheme
+        if scheme in table:
+            assert table[scheme] == {k: metrics[k] for k in ('iae', 'max_error')}
+    rival = json.loads((tmp_path / 'baseline_hindsight' / 'metrics.json').read_text())
+    assert rival['upshift_threshold'] in (0.6, 0.7)
+    for name in FIGURES:
+        assert (tmp_path / f'{name}.png').read_bytes().startswith(b'\x89PNG')
+        assert (tmp_path / f'{name}.pdf').read_bytes().startswith(b'%PDF')
+    printed = capsys.readouterr().out
+    for scheme in demo.PAPER:
+        assert f'{table[scheme]["iae"]:.4f}' in printed
+        assert f'{demo.PAPER[scheme].iae:.4f}' in printed
+
+
+def test_bench_writes_every_figure(
+    quick: Callable[..., Configuration], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, 'REPEATS', 1)
+    bench.run_bench(quick(), tmp_path)
+    content = json.loads((tmp_path / 'bench.json').read_text())
+    for name in bench.MEASUREMENTS:
+        assert content[name] == content['values'][name][0] > 0.0
+        assert content['spread'][name] == [content[name], content[name]]
+
+
+@pytest.fixture(scope='module')
+def traces(request: pytest.FixtureRequest) -> tuple[Configuration, dict[str, Trace]]:
+    from fam_bundle_bringup.experiment import default_configuration
+    from fam_bundle_model.parameters import load_configuration
+
+    configuration = load_configuration(default_configuration())
+    found = {}
+    for scheme in SCHEMES:
+        changes = {'recruitment': {'scheme': scheme}}
+        found[scheme] = run_offline(load_configuration(default_configuration(), changes))
+    return configuration, found
+
+
+def holds(configuration: Configuration, traces: dict[str, Trace]) -> dict[str, bool]:
+    return {claim.statement: claim.holds for claim in paper_claims(configuration, traces)}
+
+
+def test_claims_follow_the_traces(traces: tuple[Configuration, dict[str, Trace]]) -> None:
+    """Each claim below is turned round by changing just what it speaks of."""
+    configuration, found = traces
+    before = holds(configuration, found)
+    assert len(before) == 15
+    reference = found['baseline']['strain_reference']
+    baseline = {**found['baseline'], 'strain': reference + 0.002}
+    lag = {**found['lag'], 'strain': reference + 0.05}
+    changed = {**found, 'baseline': baseline, 'lag': lag}
+    after = holds(configuration, changed)
+    for statement, expected in (
+        ('this results in overshoot', True),
+        ('the strain lags further behind right after the upshift', False),
+        ('the lag after the shift is significantly reduced', False),
+        ('right after the shift: baseline worst, then lag, then both', False),
+    ):
+        assert before[statement] is not expected, statement
+        assert after[statement] is expected, statement
+
+
+def test_nothing_holds_where_nothing_shifts(
+    traces: tuple[Configuration, dict[str, Trace]],
+) -> None:
+    configuration, found = traces
+    still = np.ones_like(found['lag']['recruitment_state'])
+    changed = {**found, 'lag': {**found['lag'], 'recruitment_state': still}}
+    assert set(holds(configuration, changed).values()) == {False}
