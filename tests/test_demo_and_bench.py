@@ -30,7 +30,7 @@ FIGURES = {
 def test_demo_writes_all_its_results(
     quick: Callable[..., Configuration],
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    capfd: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(hindsight, 'THRESHOLDS', (0.4, 0.6, 0.7))
@@ -47,7 +47,7 @@ def test_demo_writes_all_its_results(
     for name in FIGURES:
         assert (tmp_path / f'{name}.png').read_bytes().startswith(b'\x89PNG')
         assert (tmp_path / f'{name}.pdf').read_bytes().startswith(b'%PDF')
-    printed = capsys.readouterr().out
+    printed = capfd.readouterr().out
     for scheme in demo.PAPER:
         assert f'{table[scheme]["iae"]:.4f}' in printed
         assert f'{demo.PAPER[scheme].iae:.4f}' in printed

@@ -105,12 +105,12 @@ def recording() -> Iterator[tuple['TraceRecorder', Callable[[float], None]]]:
     from fam_bundle_node.loop_node import make_executor
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    recorder, executor, never = TraceRecorder(), make_executor(), Future()
-    executor.add_node(recorder)
-    try:
-        yield recorder, lambda wait: executor.spin_until_future_complete(never, timeout_sec=wait)
-    finally:
+    with contextlib.ExitStack() as stack:
+        stack.callback(rclpy.try_shutdown)
+        recorder, never = TraceRecorder(), Future()
         # Else its subscriptions live on and hold the next run up.
-        executor.shutdown()
-        recorder.destroy_node()
-        rclpy.try_shutdown()
+        stack.callback(recorder.destroy_node)
+        executor = make_executor()
+        stack.callback(executor.shutdown)
+        executor.add_node(recorder)
+        yield recorder, lambda wait: executor.spin_until_future_complete(never, timeout_sec=wait)

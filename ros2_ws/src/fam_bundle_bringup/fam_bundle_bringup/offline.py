@@ -35,6 +35,12 @@ from fam_bundle_model.pressure_pi import PressureGains, pressure_gains
 from fam_bundle_sim.plant import Plant, plant, plant_step, resting_state, truth
 from fam_bundle_sim.sensors import Sensors, measure, noise_samples, sensors
 
+PREDICTED = (
+    'time_to_saturation',
+    'time_to_desaturation',
+    'recruitment_lag',
+    'deslack_pressure',
+)
 BLOCK = 5000  # ticks between two reports of progress
 
 
@@ -187,15 +193,19 @@ def run_offline(
 
 
 def _check_finite(trace: Trace, block: slice) -> None:
-    """Raise RunFailed at the first tick whose measurements or commands are not finite."""
-    for name in ('strain', 'force', 'source_pressure', 'mu_pressure', 'spool'):
-        values = trace[name][block].reshape(block.stop - block.start, -1)
-        bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    """Raise RunFailed at the first tick with a value that is not finite."""
+    first: dict[str, int] = {}
+    for name, column in trace.items():
+        values = column[block].reshape(block.stop - block.start, -1)
+        # Predicted times are infinite where they do not apply; nothing else may be.
+        good = ~np.isnan(values) if name in PREDICTED else np.isfinite(values)
+        bad = np.flatnonzero(~good.all(axis=1))
         if bad.size:
-            tick = block.start + int(bad[0])
-            kept = {signal: column[:tick] for signal, column in trace.items()}
-            raise RunFailed(
-                f'{name}: tick {tick} is not finite; the plant diverges, try more '
-                f'simulation.substeps ({tick} ticks are kept)',
-                kept,
-            )
+            first[name] = block.start + int(bad[0])
+    if first:
+        name, tick = min(first.items(), key=lambda item: item[1])
+        raise RunFailed(
+            f'{name}: tick {tick} is not finite; the plant diverges, try more '
+            f'simulation.substeps ({tick} ticks are kept)',
+            {signal: column[:tick] for signal, column in trace.items()},
+        )

@@ -189,7 +189,7 @@ def look_up(table: LagTable, unit: int, source_pressure: float, deslack_pressure
     time = loss = 0.0
     for weight, a, b in ((w00, i, j), (w01, i, j + 1), (w10, i + 1, j), (w11, i + 1, j + 1)):
         # Rounding must not let a neighbour that is never reached into a node of its own.
-        if weight > 1e-12:
+        if weight > 1e-12 or lag[a, b] < math.inf:
             time += weight * lag[a, b]
             loss += weight * drop[a, b]
     return Lag(time, loss, left or up)
