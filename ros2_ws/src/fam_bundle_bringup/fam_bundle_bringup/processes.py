@@ -62,10 +62,6 @@ class NodeGroup:
             )
         self._nodes.append(NodeProcess(name, process, log))
 
-    def process_ids(self) -> dict[str, int]:
-        """Return the process id of each node."""
-        return {node.name: node.process.pid for node in self._nodes}
-
     def finished(self, name: str) -> bool:
         """Return whether the node ``name`` has ended well.
 

@@ -29,7 +29,6 @@ class Recruitment(NamedTuple):
     pressure_compensation: bool
     upshift_pressure: float
     downshift_pressure: float
-    nominal_pressure: float
     strain_rate_time_constant: float
     force_time_constant: float
     minimum_strain_rate: float
@@ -70,7 +69,6 @@ def recruitment(configuration: Configuration) -> Recruitment:
         pressure_compensation=p.scheme in ('pressure', 'lag_pressure'),
         upshift_pressure=p.upshift_threshold * nominal,
         downshift_pressure=p.downshift_threshold * nominal,
-        nominal_pressure=nominal,
         strain_rate_time_constant=p.strain_rate_time_constant,
         force_time_constant=p.force_time_constant,
         minimum_strain_rate=p.minimum_strain_rate,
