@@ -23,6 +23,7 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': [
+            'composed_loop = fam_bundle_bringup.composed_loop:main',
             'fam_bundle = fam_bundle_bringup.cli:main',
         ],
     },

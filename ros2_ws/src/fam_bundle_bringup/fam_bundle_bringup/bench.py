@@ -12,8 +12,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from fam_bundle_bringup.experiment import versions, write_json
+from fam_bundle_bringup.experiment import versions
 from fam_bundle_bringup.graph import LOOP_LISTENERS, nodes_in, own_domain, start_nodes
+from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_bringup.progress import progress_bar
 from fam_bundle_model.lag_table import build_lag_table, cached_lag_table

@@ -5,8 +5,9 @@ import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
 
-from fam_bundle_bringup.experiment import Result, run_experiment, write_json
+from fam_bundle_bringup.experiment import Result, run_experiment
 from fam_bundle_bringup.hindsight import THRESHOLDS, Rival, best_threshold, with_threshold
+from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.progress import progress_bar
 from fam_bundle_io.metrics import Tracking
 from fam_bundle_io.shapes import Claim, paper_claims

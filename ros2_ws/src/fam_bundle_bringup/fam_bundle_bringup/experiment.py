@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One experiment: check, run at a pace, and write its folder."""
 
+import dataclasses
 import importlib.metadata
-import json
 import os
 import platform
 from collections.abc import Callable, Iterable, Mapping
@@ -11,16 +11,16 @@ from typing import Any, NamedTuple
 
 from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_bringup.graph import run_graph
+from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.metrics import Tracking, shift_times, tracking
 from fam_bundle_io.trace import Trace, save_trace
 from fam_bundle_model.bundle import check_reachable, motor_units
-from fam_bundle_model.files import whole_file
 from fam_bundle_model.parameters import Configuration, load_configuration, write_yaml
 from fam_bundle_model.schema import ConfigurationError
 
-PACES = ('lockstep', 'offline')
-RESULTS = ('metrics.json', 'trace.npz')
+PACES = ('lockstep', 'realtime', 'offline')
+RESULTS = ('metrics.json', 'trace.npz', 'loop_statistics.json')
 LARGEST_RUN = 20_000_000  # ticks that a trace in memory can hold
 
 
@@ -102,12 +102,6 @@ def metrics_of(configuration: Configuration, pace: str, trace: Trace) -> dict[st
     }
 
 
-def write_json(content: Any, path: Path) -> None:
-    """Write ``content`` as JSON; whole or not at all."""
-    with whole_file(path) as file:
-        file.write(json.dumps(content, indent=1, allow_nan=False).encode() + b'\n')
-
-
 def prepare_folder(folder: Path, results: Iterable[str]) -> None:
     """Make ``folder`` and take away ``results`` of an earlier call in it.
 
@@ -128,6 +122,8 @@ def run_experiment(
     pace: str,
     folder: Path,
     progress: Callable[[int], None] | None = None,
+    *,
+    composed: bool = False,
 ) -> Result:
     """Run ``configuration`` and write its parameters, trace and metrics to ``folder``.
 
@@ -140,7 +136,9 @@ def run_experiment(
         if pace == 'offline':
             trace = run_offline(configuration, progress)
         else:
-            trace = run_graph(configuration, folder, progress)
+            run = dataclasses.replace(configuration.run, pace=pace)
+            paced = dataclasses.replace(configuration, run=run)
+            trace = run_graph(paced, folder, progress, composed=composed)
     except RunFailed as error:
         save_trace(error.trace, folder / 'trace.npz')
         raise

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The loop as a graph: five nodes, each its own process, over Fast DDS in lock-step."""
+"""The loop as a graph: five nodes, each its own process or all in one, over Fast DDS."""
 
 import contextlib
 import os
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fam_bundle_bringup.domain_marker import marked
 from fam_bundle_bringup.failure import RunFailed
+from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.processes import NodeDied, NodeGroup, executable
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration, write_yaml
@@ -23,9 +24,11 @@ NODES = (
     ('fam_bundle_control', 'pressure_controller'),
     ('fam_bundle_sim', 'plant_simulator'),
 )
+COMPOSED = ('fam_bundle_bringup', 'composed_loop')
+OWNERS = ('plant_simulator', 'composed_loop')  # hold the plant, whose end is the run's
 LOOP_LISTENERS = 3  # strain controller, supervisor, pressure controller
 SLICE = 0.05  # s of listening between two looks at the processes
-DRAIN_TIMEOUT = 10.0  # s for the last messages after the plant has ended
+DRAIN_TIMEOUT = 2.0  # s without a command, after the plant has ended
 
 
 @contextlib.contextmanager
@@ -39,16 +42,19 @@ def own_domain() -> Iterator[int]:
     os.environ['ROS_DOMAIN_ID'] = str(number)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     try:
-        yield int(number)
+        with marked(int(number)):
+            yield int(number)
     finally:
         reservation.__exit__(None, None, None)
 
 
-def start_nodes(group: NodeGroup, parameter_file: Path, listeners: int) -> None:
-    """Start the five nodes with one parameter file."""
-    for package, name in NODES:
+def start_nodes(
+    group: NodeGroup, parameter_file: Path, listeners: int, *, composed: bool = False
+) -> None:
+    """Start the nodes with one parameter file, each as a process or all in one."""
+    for package, name in (COMPOSED,) if composed else NODES:
         command = [executable(package, name), '--ros-args', '--params-file', str(parameter_file)]
-        if name == 'plant_simulator':
+        if name in OWNERS:
             command += ['-p', f'run.listeners:={listeners}']
         group.start(name, command)
 
@@ -57,36 +63,49 @@ def run_graph(
     configuration: Configuration,
     folder: Path,
     progress: Callable[[int], None] | None = None,
+    *,
+    composed: bool = False,
 ) -> Trace:
     """Run ``configuration`` through the graph and return its trace.
 
-    The nodes' parameter file and what they print go to ``folder``. ``progress`` is called with
-    the ticks done so far. Raises RunFailed when a node ends early or messages stay missing.
+    The nodes' parameter file, what they print and their loop statistics go to ``folder``.
+    ``progress`` is called with the ticks done so far. Raises RunFailed when a node ends early or
+    messages stay missing; in real time, where samples may be skipped, when none came through.
     """
     parameter_file = folder / 'parameters.yaml'
     write_yaml(configuration, parameter_file)
-    units, ticks = len(configuration.fam.count), configuration.ticks()
+    owner = COMPOSED[1] if composed else 'plant_simulator'
     failure = None
     with own_domain(), recording() as (recorder, listen):
         with nodes_in(folder) as group:
-            start_nodes(group, parameter_file, LOOP_LISTENERS + 1)
+            start_nodes(group, parameter_file, LOOP_LISTENERS + 1, composed=composed)
             try:
-                while not group.finished('plant_simulator'):
+                while not group.finished(owner):
                     listen(SLICE)
                     if progress is not None:
-                        progress(recorder.ticks())
-                drained = time.monotonic() + DRAIN_TIMEOUT
-                while recorder.complete_ticks() < ticks and time.monotonic() < drained:
-                    listen(SLICE)
+                        progress(recorder.samples())
+                drain(recorder, listen)
             except NodeDied as error:
                 failure = str(error)
-        trace = recorder.trace(units)
-    recorded = len(trace['time'])
-    if failure is None and recorded < ticks:
-        failure = f'tick {recorded} of {ticks} did not reach the trace on every topic'
+        trace = recorder.trace(len(configuration.fam.count))
+        write_json(recorder.reports(), folder / 'loop_statistics.json')
+    recorded, wanted = len(trace['time']), configuration.ticks()
+    if configuration.run.pace == 'realtime':
+        wanted = min(wanted, 1)
+    if failure is None and recorded < wanted:
+        failure = f'tick {recorded} of {wanted} did not reach the trace on every topic'
     if failure is not None:
         raise RunFailed(f'{failure} ({recorded} ticks are kept)', trace)
     return trace
+
+
+def drain(recorder: 'TraceRecorder', listen: Callable[[float], None]) -> None:
+    """Listen until every sample has its command, or none has come for a while."""
+    waited, commands = 0.0, -1
+    while recorder.commands() < recorder.samples() and waited < DRAIN_TIMEOUT:
+        waited = waited + SLICE if recorder.commands() == commands else 0.0
+        commands = recorder.commands()
+        listen(SLICE)
 
 
 def nodes_in(folder: Path) -> NodeGroup:
@@ -102,7 +121,7 @@ def recording() -> Iterator[tuple['TraceRecorder', Callable[[float], None]]]:
     from rclpy.task import Future
 
     from fam_bundle_io.trace_recorder_node import TraceRecorder
-    from fam_bundle_node.loop_node import make_executor
+    from fam_bundle_node.run import make_executor
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     with contextlib.ExitStack() as stack:

@@ -18,8 +18,9 @@ from fam_bundle_model.schema import ConfigurationError, make_group
 from fam_bundle_msgs.msg import LagTable as LagTableMessage
 from fam_bundle_msgs.srv import GetLagTable, QueryLag, RebuildLagTable
 from fam_bundle_node.lag_table_message import to_message
-from fam_bundle_node.loop_node import LoopNode, run_node
+from fam_bundle_node.loop_node import LoopNode
 from fam_bundle_node.qos import LATCHED
+from fam_bundle_node.run import run_node
 
 
 class LagTableServer(LoopNode):

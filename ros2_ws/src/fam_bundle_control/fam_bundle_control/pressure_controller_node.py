@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 
 from fam_bundle_control.pressure_loop import pressure_loop_step
+from fam_bundle_model.hydraulics import TO_TANK
 from fam_bundle_model.pressure_pi import pressure_gains
 from fam_bundle_msgs.msg import BundleState, PressureReference, RecruitmentState, ValveCommand
-from fam_bundle_node.loop_node import LoopNode, run_node
-from fam_bundle_node.stamps import StampClock
-from fam_bundle_node.ticks import TickError, TickJoin, check_finite, check_length
+from fam_bundle_node.loop_node import Controller
+from fam_bundle_node.run import run_node
+from fam_bundle_node.ticks import TickJoin
 
 TOPICS = ('bundle_state', 'pressure_reference', 'recruitment_state')
 
 
-class PressureController(LoopNode):
+class PressureController(Controller):
     """Computes a tick when it holds the measurement and both references of that tick."""
 
     def __init__(self) -> None:
@@ -28,13 +29,24 @@ class PressureController(LoopNode):
         self.integral = np.zeros(units)
         self.wanted, self.spool = np.zeros(units), np.zeros(units)
         self.saturated = np.zeros(units, dtype=np.bool_)
-        self.clock = StampClock(self.configuration.period_ns())
         self.command(0, 0.0, 0.0, 0.0, np.zeros(units), 1.0)  # compiles the law, changes nothing
-        self.join = TickJoin(TOPICS)
+        self.join = TickJoin(TOPICS, self.counts, strict=not self.realtime)
         self.publisher = self.loop_publisher(ValveCommand, 'valve_command')
         self.listen(PressureReference, 'pressure_reference')
         self.listen(RecruitmentState, 'recruitment_state')
         self.listen(BundleState, 'bundle_state')
+
+    def restart(self) -> None:
+        """Start without integral share: the references start from the measured pressure."""
+        self.integral[:] = 0.0
+
+    def missing(self) -> str:
+        """Return what this node waits for."""
+        waiting = self.join.waits_for('bundle_state')
+        if waiting is None:
+            return super().missing()
+        tick, topics = waiting
+        return f'{" and ".join(topics)} of tick {tick}'
 
     def listen(self, message_type: type, topic: str) -> None:
         """Subscribe to one of the three topics."""
@@ -78,33 +90,28 @@ class PressureController(LoopNode):
         self, seen: BundleState, reference: PressureReference, recruitment: RecruitmentState
     ) -> None:
         """Answer one tick."""
-        check_length('bundle_state', seen.tick, seen.mu_pressure, len(self.spool))
-        check_finite('bundle_state', seen.tick, (seen.source_pressure, *seen.mu_pressure))
-        check_finite('pressure_reference', seen.tick, (reference.pressure,))
-        compensation = recruitment.pressure_compensation
-        if not 1 <= recruitment.recruited <= len(self.spool):
-            raise TickError(
-                f'recruitment_state: tick {seen.tick} holds {recruitment.recruited} recruited; '
-                f'must be from 1 to {len(self.spool)}'
-            )
-        check_finite('recruitment_state', seen.tick, (compensation,))
+        dt = self.time_step(seen)
         self.command(
             recruitment.recruited,
             reference.pressure,
-            compensation,
+            recruitment.pressure_compensation,
             seen.source_pressure,
             np.array(seen.mu_pressure),
-            self.clock.since_last(seen.header.stamp),
+            dt,
         )
+        if self.trouble:
+            self.spool[:] = TO_TANK
         self.publisher.publish(
             ValveCommand(
                 header=seen.header,
                 tick=seen.tick,
+                vent=bool(self.trouble),
                 spool=self.spool.tolist(),
                 pressure_reference=self.wanted.tolist(),
                 saturated=self.saturated.tolist(),
             )
         )
+        self.meter.answered(seen.tick, seen.steady_time)
 
 
 def main() -> None:

@@ -77,7 +77,7 @@ def recruitment(configuration: Configuration) -> Recruitment:
 
 
 def recruitment_start() -> RecruitmentState:
-    """Return the state before the first tick: one motor unit recruited."""
+    """Return the state before the first tick, which finds the recruited units by pressure."""
     return RecruitmentState(1, 0.0, 0.0, 0.0, math.inf, False, False)
 
 
@@ -120,6 +120,23 @@ def filtered(previous: float, value: float, time_constant: float, dt: float) -> 
 
 
 @compiled
+def taut_units(
+    units: tuple[MotorUnit, ...], mu_pressure: npt.NDArray[np.float64], strain: float
+) -> int:
+    """Return how many units in a row, from the first on, are above their de-slack pressure.
+
+    At least 1. So a supervisor that joins a running loop goes on with what is recruited.
+    """
+    count = 1
+    while count < len(units):
+        pressure = mu_pressure[count]
+        if pressure <= 0.0 or pressure <= fam.deslack_pressure(units[count].fam, strain):
+            break
+        count += 1
+    return count
+
+
+@compiled
 def recruitment_step(
     law: Recruitment,
     units: tuple[MotorUnit, ...],
@@ -137,7 +154,9 @@ def recruitment_step(
     """
     recruited = state.recruited
     rate, load = 0.0, force
-    if state.started:
+    if not state.started:
+        recruited = taut_units(units, mu_pressure, strain)
+    else:
         rate = (strain - state.strain) / dt
         rate = filtered(state.strain_rate, rate, law.strain_rate_time_constant, dt)
         load = filtered(state.force, force, law.force_time_constant, dt)

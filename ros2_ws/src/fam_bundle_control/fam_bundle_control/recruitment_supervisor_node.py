@@ -17,13 +17,12 @@ from fam_bundle_model.lag_table import PHYSICS, LagTable, lag_table_hash
 from fam_bundle_msgs.msg import BundleState, RecruitmentState
 from fam_bundle_msgs.msg import LagTable as LagTableMessage
 from fam_bundle_node.lag_table_message import from_message
-from fam_bundle_node.loop_node import LoopNode, run_node
+from fam_bundle_node.loop_node import Controller
 from fam_bundle_node.qos import LATCHED
-from fam_bundle_node.stamps import StampClock
-from fam_bundle_node.ticks import check_finite, check_length
+from fam_bundle_node.run import run_node
 
 
-class RecruitmentSupervisor(LoopNode):
+class RecruitmentSupervisor(Controller):
     """Waits for the lag table, then decides at each tick."""
 
     def __init__(self) -> None:
@@ -32,10 +31,13 @@ class RecruitmentSupervisor(LoopNode):
         self.law = recruitment(self.configuration)
         self.units = motor_units(self.configuration)
         self.table: LagTable | None = None
-        self.state = recruitment_start()
-        self.clock = StampClock(self.configuration.period_ns())
+        self.restart()
         self.publisher = self.loop_publisher(RecruitmentState, 'recruitment_state')
         self.create_subscription(LagTableMessage, 'lag_table', self.on_lag_table, LATCHED)
+
+    def restart(self) -> None:
+        """Find the recruited motor units from their pressures."""
+        self.memory = recruitment_start()
 
     def on_lag_table(self, message: LagTableMessage) -> None:
         """Take the table if it belongs to these parameters; start with the first one."""
@@ -69,7 +71,7 @@ class RecruitmentSupervisor(LoopNode):
             self.law,
             self.units,
             self.table,
-            self.state,
+            self.memory,
             strain,
             force,
             source_pressure,
@@ -79,19 +81,22 @@ class RecruitmentSupervisor(LoopNode):
 
     def on_bundle_state(self, seen: BundleState) -> None:
         """Answer one tick."""
-        check_length('bundle_state', seen.tick, seen.mu_pressure, len(self.units))
-        measured = (seen.strain, seen.force, seen.source_pressure, *seen.mu_pressure)
-        check_finite('bundle_state', seen.tick, measured)
-        self.state, output = self.decide(
+        dt = self.time_step(seen)
+        self.memory, output = self.decide(
             seen.strain,
             seen.force,
             seen.source_pressure,
             np.array(seen.mu_pressure),
-            self.clock.since_last(seen.header.stamp),
+            dt,
         )
         self.publisher.publish(
             RecruitmentState(header=seen.header, tick=seen.tick, **output._asdict())
         )
+        self.meter.answered(seen.tick, seen.steady_time)
+
+    def missing(self) -> str:
+        """Return what this node waits for."""
+        return 'lag_table' if self.table is None else super().missing()
 
 
 def main() -> None:

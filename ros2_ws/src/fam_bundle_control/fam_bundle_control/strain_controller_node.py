@@ -7,12 +7,12 @@ from fam_bundle_control.reference import strain_reference
 from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
 from fam_bundle_model.parameters import seconds
 from fam_bundle_msgs.msg import BundleState, PressureReference
-from fam_bundle_node.loop_node import LoopNode, run_node
-from fam_bundle_node.stamps import StampClock
-from fam_bundle_node.ticks import check_finite, check_length
+from fam_bundle_node.loop_node import Controller
+from fam_bundle_node.run import run_node
+from fam_bundle_node.stamps import nanoseconds
 
 
-class StrainController(LoopNode):
+class StrainController(Controller):
     """Owns the reference trajectory and the outer PI."""
 
     def __init__(self) -> None:
@@ -21,24 +21,23 @@ class StrainController(LoopNode):
             'strain_controller', ('fam', 'strain_loop', 'source', 'reference', 'simulation')
         )
         self.law = strain_loop(self.configuration)
-        self.state = strain_loop_start()
-        self.clock = StampClock(self.configuration.period_ns())
+        self.restart()
         self.publisher = self.loop_publisher(PressureReference, 'pressure_reference')
-        strain_loop_step(self.law, self.state, 0.0, 0.0, 0.0, 0.0, 1.0)
+        strain_loop_step(self.law, self.state_of_law, 0.0, 0.0, 0.0, 0.0, 1.0)
         self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state)
+
+    def restart(self) -> None:
+        """Set in at the first motor unit's measured pressure."""
+        self.state_of_law = strain_loop_start()
 
     def on_bundle_state(self, seen: BundleState) -> None:
         """Answer one tick."""
-        units = len(self.configuration.fam.count)
-        check_length('bundle_state', seen.tick, seen.mu_pressure, units)
-        measured = (seen.strain, seen.source_pressure, *seen.mu_pressure)
-        check_finite('bundle_state', seen.tick, measured)
-        dt = self.clock.since_last(seen.header.stamp)
-        time = seconds(seen.tick * self.configuration.period_ns())
+        dt = self.time_step(seen)
+        time = seconds(nanoseconds(seen.header.stamp))
         reference = strain_reference(self.configuration.reference, time)
-        self.state, output = strain_loop_step(
+        self.state_of_law, output = strain_loop_step(
             self.law,
-            self.state,
+            self.state_of_law,
             reference,
             seen.strain,
             seen.source_pressure,
@@ -55,6 +54,7 @@ class StrainController(LoopNode):
                 pressure_unlimited=output.unlimited,
             )
         )
+        self.meter.answered(seen.tick, seen.steady_time)
 
 
 def main() -> None:

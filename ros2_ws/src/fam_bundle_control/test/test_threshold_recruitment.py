@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from fam_bundle_control.recruitment import recruitment
+from fam_bundle_model import fam
 
 UP, DOWN = 500e3, 250e3  # the thresholds of conftest.py's law
 
@@ -31,6 +32,7 @@ def test_the_upshift_comes_exactly_at_its_threshold(supervisor):
 
 
 def test_only_the_first_units_pressure_shifts_up(supervisor):
+    supervisor.step()
     assert supervisor.step(10, pressures=(0.5 * UP, 2.0 * UP)).recruited == 1
 
 
@@ -92,3 +94,10 @@ def test_the_predictions_are_made_all_the_same(supervisor):
     assert 0.0 < output.time_to_saturation < np.inf
     assert output.recruitment_lag == pytest.approx(0.2)
     assert output.pressure_compensation == 0.0
+
+
+@pytest.mark.parametrize('taut', [1, 2])
+def test_a_start_in_mid_run_goes_on_with_the_units_that_are_taut(supervisor, taut):
+    deslack = fam.deslack_pressure(supervisor.units[1].fam, 0.05)
+    second = np.nextafter(deslack, 0.0 if taut == 1 else 1e6)
+    assert supervisor.step(pressures=(400e3, second)).recruited == taut

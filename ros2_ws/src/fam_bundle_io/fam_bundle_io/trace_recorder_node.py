@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS node that keeps every message of the loop in memory and makes a trace of them."""
 
+import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from rclpy.node import Node
@@ -9,8 +11,15 @@ from rclpy.serialization import deserialize_message
 
 from fam_bundle_io.trace import Trace, empty_trace
 from fam_bundle_model.parameters import seconds
-from fam_bundle_msgs.msg import BundleState, PressureReference, RecruitmentState, ValveCommand
-from fam_bundle_node.qos import RECORDER_SUBSCRIPTION
+from fam_bundle_msgs.msg import (
+    BundleState,
+    LoopStatistics,
+    PressureReference,
+    RecruitmentState,
+    ValveCommand,
+)
+from fam_bundle_node.qos import RECORDER_SUBSCRIPTION, REPORTS
+from fam_bundle_node.stamps import nanoseconds
 
 TOPICS = {
     'pressure_reference': PressureReference,
@@ -27,6 +36,10 @@ class TraceRecorder(Node):
         """Listen to the answers; to the plant, which starts the run, when these are matched."""
         super().__init__('trace_recorder')
         self.raw: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
+        self.statistics: list[LoopStatistics] = []
+        self.create_subscription(
+            LoopStatistics, 'loop_statistics', self.statistics.append, REPORTS
+        )
         for topic in TOPICS:
             if topic != 'bundle_state':
                 self.listen(topic)
@@ -43,31 +56,48 @@ class TraceRecorder(Node):
         keep: Callable[[bytes], None] = self.raw[topic].append
         self.create_subscription(TOPICS[topic], topic, keep, RECORDER_SUBSCRIPTION, raw=True)
 
-    def ticks(self) -> int:
-        """Return how many ticks of the plant have come."""
+    def samples(self) -> int:
+        """Return how many samples of the plant have come."""
         return len(self.raw['bundle_state'])
 
-    def complete_ticks(self) -> int:
-        """Return how many ticks have come on every topic."""
-        return min(len(messages) for messages in self.raw.values())
+    def commands(self) -> int:
+        """Return how many valve commands have come."""
+        return len(self.raw['valve_command'])
 
     def trace(self, units: int) -> Trace:
-        """Return the trace of all ticks before the first one that is missing on some topic."""
-        trace = empty_trace(self.complete_ticks(), units)
-        for topic, message_type in TOPICS.items():
-            ticks = len(trace['time'])
-            for row, raw in enumerate(self.raw[topic][:ticks]):
-                message = deserialize_message(raw, message_type)
-                if message.tick != row:
-                    trace = {name: values[:row] for name, values in trace.items()}
-                    break
-                _FILL[topic](trace, row, message)
+        """Return the trace of all ticks that came on every topic, each at its first coming."""
+        found = {topic: self._by_tick(topic) for topic in TOPICS}
+        ticks = sorted(set.intersection(*(set(messages) for messages in found.values())))
+        trace = empty_trace(len(ticks), units)
+        for topic, messages in found.items():
+            for row, tick in enumerate(ticks):
+                _FILL[topic](trace, row, messages[tick])
         return trace
+
+    def _by_tick(self, topic: str) -> dict[int, Any]:
+        messages: dict[int, Any] = {}
+        for raw in self.raw[topic]:
+            message = deserialize_message(raw, TOPICS[topic])
+            messages.setdefault(message.tick, message)
+        return messages
+
+    def reports(self) -> list[dict[str, Any]]:
+        """Return the loop statistics of all nodes, in the order in which they came."""
+        return [_plain(message) for message in self.statistics]
+
+
+def _plain(report: LoopStatistics) -> dict[str, Any]:
+    """Return the fields of a report as JSON can hold them: what is not finite is None."""
+    fields = {name: getattr(report, name) for name in report.get_fields_and_field_types()}
+    fields['header'] = seconds(nanoseconds(report.header.stamp))
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in fields.items()
+    }
 
 
 def _fill_state(trace: Trace, row: int, message: BundleState) -> None:
-    stamp = message.header.stamp
-    trace['time'][row] = seconds(stamp.sec * 1_000_000_000 + stamp.nanosec)
+    trace['time'][row] = seconds(nanoseconds(message.header.stamp))
     trace['strain'][row] = message.strain
     trace['force'][row] = message.force
     trace['source_pressure'][row] = message.source_pressure

@@ -7,6 +7,9 @@ from typing import NamedTuple
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.parameters import Configuration
 
+# Spool command that opens a motor unit fully to the tank: the safe state.
+TO_TANK = -1.0
+
 
 class HydraulicLaw(NamedTuple):
     """Constants of the supply side; SI units.

@@ -17,6 +17,7 @@ from fam_bundle_model.files import whole_file
 from fam_bundle_model.schema import (
     ConfigurationError,
     choice,
+    flag,
     integer,
     make_group,
     number,
@@ -25,6 +26,7 @@ from fam_bundle_model.schema import (
     unknown,
 )
 
+PACES = ('lockstep', 'realtime')
 SCHEMES = ('baseline', 'lag', 'pressure', 'lag_pressure')
 GRAVITY = 9.80665  # m/s^2
 
@@ -202,9 +204,9 @@ class ReferenceParameters:
 
 @dataclass(frozen=True)
 class RunParameters:
-    """How the graph is run; nothing here changes a result."""
+    """How the graph is run; in lock-step nothing here changes a result."""
 
-    pace: str = choice('what paces the plant simulator', ('lockstep',), default='lockstep')
+    pace: str = choice('what paces the graph: each other, or a clock', PACES, default='lockstep')
     listeners: int = integer(
         'subscriptions of bundle_state to wait for before tick 0', 1, 100, default=3
     )
@@ -214,6 +216,30 @@ class RunParameters:
     answer_timeout: float = positive(
         's', 'wall time without the answer to a tick that ends a lock-step run', default=20.0
     )
+    command_timeout: float = positive(
+        's', 'time without commands after which a plant in real time goes safe', default=0.02
+    )
+    busy_tail: float = number(
+        's', 'end of each real-time wait that is spent awake', default=0.0, minimum=0.0
+    )
+
+
+@dataclass(frozen=True)
+class ProcessParameters:
+    """How each node's process is run; nothing here changes a result."""
+
+    executor: str = choice('executor of rclpy', ('events', 'single_threaded'), default='events')
+    priority: int = integer(
+        'SCHED_FIFO priority of all threads; 0 asks for no priority', 0, 99, default=0
+    )
+    cpu_mask: int = integer(
+        'bit mask of the CPUs that the process may use; 0 is all', 0, 2**52, default=0
+    )
+    lock_memory: bool = flag('keep all memory from being paged out', default=False)
+    timer_slack: float = number(
+        's', 'how late the kernel may wake a sleeper; 0 keeps its own', default=1e-6, minimum=0.0
+    )
+    freeze_garbage: bool = flag('spare the garbage collector what start-up left', default=True)
 
 
 @dataclass(frozen=True)
@@ -234,6 +260,7 @@ class Configuration:
     lag_table: LagTableParameters
     reference: ReferenceParameters
     run: RunParameters
+    process: ProcessParameters
 
     def duration(self) -> float:
         """Return the length of the run in s."""
@@ -249,7 +276,7 @@ class Configuration:
 
     def hash(self, *groups: str) -> str:
         """Return a SHA-256 over the values of the named groups, or of all that shape a result."""
-        names = groups or [name for name in GROUPS if name != 'run']
+        names = groups or [name for name in GROUPS if name not in ('run', 'process')]
         chosen = {name: dataclasses.asdict(getattr(self, name)) for name in names}
         return hashlib.sha256(json.dumps(chosen, sort_keys=True).encode()).hexdigest()
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a parameter is declared: type, unit, range and one sentence, stated once.
 
-A group is a frozen dataclass whose fields are made by ``number``, ``integer``, ``choice`` or
-``per_unit``. Validation, the YAML loader, ROS parameter descriptors and the reference page all
-read the same declaration.
+A group is a frozen dataclass whose fields are made by ``number``, ``integer``, ``choice``,
+``flag`` or ``per_unit``. Validation, the YAML loader, ROS parameter descriptors and the reference
+page all read the same declaration.
 """
 
 import dataclasses
@@ -24,8 +24,8 @@ class Declaration:
     """What is known of one parameter besides its value.
 
     ``unit`` is an SI unit or empty; ``minimum`` and ``maximum`` bound the value, and
-    ``exclusive`` says that the minimum itself is not allowed. ``kind`` is ``float``, ``int`` or
-    ``str``; ``array`` marks one value per motor unit (a single value serves all of them).
+    ``exclusive`` says that the minimum itself is not allowed. ``kind`` is ``float``, ``int``,
+    ``bool`` or ``str``; ``array`` marks one value per motor unit (a single value serves all).
     """
 
     kind: type
@@ -41,6 +41,8 @@ class Declaration:
         """Return the allowed range in words."""
         if self.choices:
             return 'must be one of ' + ', '.join(self.choices)
+        if self.kind is bool:
+            return 'must be true or false'
         bounds = []
         if self.minimum > -math.inf:
             bounds.append(f'{">" if self.exclusive else ">="} {self._plain(self.minimum)}')
@@ -66,6 +68,10 @@ class Declaration:
         refused = ConfigurationError(f'{name} = {value}{unit}: {self.bound()}')
         if self.choices:
             if value not in self.choices:
+                raise refused
+            return value
+        if self.kind is bool:
+            if not isinstance(value, bool):
                 raise refused
             return value
         try:
@@ -106,6 +112,11 @@ def integer(text: str, minimum: int, maximum: int, *, default: int | None = None
 def choice(text: str, choices: tuple[str, ...], *, default: str | None = None) -> Any:
     """Declare one word out of ``choices``."""
     return _field(Declaration(str, '', text, choices=choices), default)
+
+
+def flag(text: str, *, default: bool) -> Any:
+    """Declare true or false."""
+    return _field(Declaration(bool, '', text), default)
 
 
 def per_unit(kind: type, unit: str, text: str, **bounds: Any) -> Any:

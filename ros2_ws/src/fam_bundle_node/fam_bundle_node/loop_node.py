@@ -1,38 +1,64 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every node of the loop shares: parameters, start-up, errors, executor and exit status."""
+"""What every node of the loop shares: parameters, admission of messages, statistics, errors."""
 
-import contextlib
-import gc
-import os
-import sys
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import rclpy
-from rclpy.executors import Executor, ExternalShutdownException
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.task import Future
 
 from fam_bundle_model.parameters import Configuration
 from fam_bundle_model.schema import ConfigurationError
+from fam_bundle_node.checks import CHECKS
 from fam_bundle_node.declare import declare_configuration
-from fam_bundle_node.qos import LOOP_PUBLISHER, LOOP_SUBSCRIPTION
-from fam_bundle_node.ticks import TickError, TickOrder
+from fam_bundle_node.loop_meter import LoopMeter
+from fam_bundle_node.qos import LOOP_PUBLISHER, LOOP_SUBSCRIPTION, REALTIME_SUBSCRIPTION
+from fam_bundle_node.stamps import StampClock
+from fam_bundle_node.statistics_publisher import StatisticsPublisher
+from fam_bundle_node.ticks import Strikes, TickCounts, TickError, TickFilter, TickOrder
 
-INTERRUPTED = 130
+# Parameter groups that every node of the loop declares.
+COMMON = ('run', 'process')
+REPORT_PERIOD = 1.0  # s
+STALE = 5.0  # command time-outs; nobody waits for the answer to an older sample
+FUTURE = -1_000_000  # ns; a sample that is stamped further ahead than this was not taken
 
 
 class LoopNode(Node):
-    """A node that publishes and consumes one message per tick."""
+    """A node that publishes and consumes one message per tick.
+
+    In lock-step a message that is missing, out of order or bad ends the node. In real time it is
+    counted and dropped, and three in a row are a trouble that lasts until they have ceased.
+    """
 
     def __init__(self, name: str, groups: Iterable[str]) -> None:
         """Declare the parameters of ``groups``; raises ConfigurationError when one is bad."""
         super().__init__(name)
         self.done: Future = Future()
+        self.trouble = ''
+        self.meter = LoopMeter()
         self._order = TickOrder()
-        self.configuration: Configuration = declare_configuration(self, groups)
+        self._strikes = Strikes()
+        self._newest = 0  # steady time of a sample (ns)
+        try:
+            self.configuration: Configuration = declare_configuration(self, (*groups, *COMMON))
+        except ConfigurationError:
+            self.destroy_node()
+            raise
+        self.realtime = self.configuration.run.pace == 'realtime'
+        self.statistics = StatisticsPublisher(self, self.meter)
+        self.create_steady_timer(REPORT_PERIOD, self.report)
+
+    @property
+    def counts(self) -> TickCounts:
+        """What went wrong with the messages of this node."""
+        return self.meter.counts
+
+    def create_steady_timer(self, period: float, callback: Callable[[], None]) -> Any:
+        """Return a timer that no step of the system clock can hold up; ``period`` in s."""
+        return self.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def loop_publisher(self, message_type: type, topic: str) -> Publisher:
         """Return a publisher for a topic of the loop."""
@@ -41,18 +67,85 @@ class LoopNode(Node):
     def loop_subscription(
         self, message_type: type, topic: str, callback: Callable[[Any], None]
     ) -> None:
-        """Subscribe to a topic of the loop; ticks out of order and bad data end the node."""
+        """Subscribe to a topic of the loop; ``callback`` gets what may be used."""
+        admit = self._in_real_time(topic) if self.realtime else self._in_lockstep(topic)
 
-        def checked(message: Any) -> None:
-            if self.done.done():
-                return
+        def received(message: Any) -> None:
+            if not self.done.done():
+                admit(message, callback)
+
+        quality = REALTIME_SUBSCRIPTION if self.realtime else LOOP_SUBSCRIPTION
+        self.create_subscription(message_type, topic, received, quality)
+
+    def _in_lockstep(self, topic: str) -> Callable[[Any, Callable[[Any], None]], None]:
+        def admit(message: Any, callback: Callable[[Any], None]) -> None:
             try:
                 self._order.check(topic, message.tick)
+                CHECKS[topic](message, self.motor_units())
                 callback(message)
             except TickError as error:
                 self.fail(str(error))
 
-        self.create_subscription(message_type, topic, checked, LOOP_SUBSCRIPTION)
+        return admit
+
+    def _in_real_time(self, topic: str) -> Callable[[Any, Callable[[Any], None]], None]:
+        ticks = TickFilter(self.counts) if topic == 'bundle_state' else None
+
+        def admit(message: Any, callback: Callable[[Any], None]) -> None:
+            unusable = self._unusable()
+            try:
+                CHECKS[topic](message, self.motor_units())
+                if ticks is None or (self._is_fresh(message) and ticks.admit(message.tick)):
+                    callback(message)
+                reason = f'{topic}: tick {message.tick} came twice or out of order'
+            except TickError as error:
+                self.counts.refused += 1
+                reason = str(error)
+            if self._unusable() == unusable:
+                self._strikes.good()
+            elif self._strikes.strike():
+                self.get_trouble(reason)
+            if self.trouble and self._strikes.clear:
+                self.trouble = ''
+
+        return admit
+
+    def _unusable(self) -> int:
+        return self.counts.duplicate + self.counts.out_of_order + self.counts.refused
+
+    def _is_fresh(self, sample: Any) -> bool:
+        """Return whether a sample is of now, and count it if it is late."""
+        age = self.meter.age(sample.steady_time)
+        if age is None:
+            return True
+        if age < FUTURE:
+            raise TickError(f'bundle_state: tick {sample.tick} is {-age} ns ahead of the clock')
+        late = age > STALE * self.configuration.run.command_timeout * 1e9
+        if sample.tick == 0:  # waits for its answer, but must not be of a run that was before
+            late = sample.steady_time <= self._newest
+        self.counts.late += late
+        if not late:
+            self._newest = sample.steady_time
+        return not late
+
+    def motor_units(self) -> int:
+        """Return the number of motor units."""
+        return len(self.configuration.fam.count)
+
+    def get_trouble(self, reason: str) -> None:
+        """Note a fault: three messages in a row could not be used."""
+        if not self.trouble:
+            self.trouble = reason
+            self.get_logger().error(reason)
+            self.report()
+
+    def state(self) -> str:
+        """Return 'running', or why this node is not."""
+        return self.trouble or 'running'
+
+    def report(self) -> None:
+        """Publish how well this node keeps up."""
+        self.statistics.publish(self.state())
 
     def succeed(self) -> None:
         """End the node with exit status 0."""
@@ -65,56 +158,42 @@ class LoopNode(Node):
             self.get_logger().fatal(message)
             self.done.set_result(1)
 
-
-def make_executor() -> Executor:
-    """Return the events executor, or the default one where rclpy has none."""
-    try:
-        from rclpy.experimental.events_executor import EventsExecutor
-    except ImportError:
-        from rclpy.executors import SingleThreadedExecutor
-
-        return SingleThreadedExecutor()
-    return EventsExecutor()
+    def close(self) -> None:
+        """End what the node does beside its callbacks."""
 
 
-def ask_for_batch_scheduling() -> None:
-    """Let nobody that this process wakes pre-empt it: a fifth more ticks per second in lock-step.
+class Controller(LoopNode):
+    """A node of the loop that answers each ``bundle_state``."""
 
-    Else a publisher is put aside by its first reader before it has served the others. Threads
-    made later inherit it; it needs no rights. Does nothing where the system has no such policy.
-    """
-    with contextlib.suppress(AttributeError, OSError):
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    def __init__(self, name: str, groups: Iterable[str]) -> None:
+        """Know no sample yet."""
+        super().__init__(name, groups)
+        self.stamps = StampClock(self.configuration.period_ns())
+        self._reported = 0
 
+    def restart(self) -> None:
+        """Bring the law to its start, from which it sets in without a bump."""
+        raise NotImplementedError
 
-def run_node(make_node: Callable[[], LoopNode]) -> int:
-    """Run a node until it is done or told to stop, and return its exit status.
+    def time_step(self, sample: Any) -> float:
+        """Return the time in s since the last sample; restart the law where that has no meaning.
 
-    0 when it has done its work, 1 after a failure, 2 for a bad configuration, 130 when it was told
-    to stop before.
-    """
-    ask_for_batch_scheduling()
-    try:
-        rclpy.init()
-    except rclpy_implementation.RCLError as error:  # a parameter file that is missing or no YAML
-        print(' '.join(str(error).split()), file=sys.stderr)
-        return 2
-    try:
-        node = make_node()
-    except ConfigurationError as error:
-        print(f'{error} (parameters: --ros-args --params-file FILE)', file=sys.stderr)
-        rclpy.try_shutdown()
-        return 2
-    executor = make_executor()
-    executor.add_node(node)
-    gc.collect()
-    gc.freeze()  # numba leaves half a million objects that no later collection need look at
-    try:
-        # A finite wait: an unbounded one answers no signal with the events executor.
-        while rclpy.ok() and not node.done.done():
-            executor.spin_until_future_complete(node.done, timeout_sec=1.0)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    status = node.done.result() if node.done.done() else INTERRUPTED
-    rclpy.try_shutdown()
-    return status
+        That is at the start of a run, after a gap, and as long as the plant is safe: a law whose
+        output is not applied must not wind up. Raises TickError when time stands still.
+        """
+        gap = self.stamps.gap(sample.header.stamp)
+        if sample.tick == 0 or sample.safe or gap > self.configuration.run.command_timeout:
+            self.stamps.restart()
+            self.restart()
+        return self.stamps.since_last(sample.header.stamp)
+
+    def state(self) -> str:
+        """Return 'running', or why this node is not."""
+        if not self.trouble and self.meter.ticks == self._reported:
+            return f'waiting for {self.missing()}'
+        self._reported = self.meter.ticks
+        return super().state()
+
+    def missing(self) -> str:
+        """Return what this node waits for."""
+        return 'bundle_state'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time steps from the stamps of messages. Pure Python."""
+"""Times and time steps from the stamps of messages. Pure Python."""
 
 from typing import Protocol
 
@@ -14,6 +14,11 @@ class Stamp(Protocol):
     nanosec: int
 
 
+def nanoseconds(stamp: Stamp) -> int:
+    """Return ``stamp`` in ns."""
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
+
+
 class StampClock:
     """Turns the stamps of successive messages into time steps."""
 
@@ -22,9 +27,17 @@ class StampClock:
         self._first_step_ns = first_step_ns
         self._last_ns: int | None = None
 
+    def restart(self) -> None:
+        """Take the next stamp as the first."""
+        self._last_ns = None
+
+    def gap(self, stamp: Stamp) -> float:
+        """Return the time in s since the stamp before, or 0 at the first one."""
+        return 0.0 if self._last_ns is None else seconds(nanoseconds(stamp) - self._last_ns)
+
     def since_last(self, stamp: Stamp) -> float:
         """Return the time in s since the stamp before; raises TickError when time stands still."""
-        now_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+        now_ns = nanoseconds(stamp)
         last_ns = now_ns - self._first_step_ns if self._last_ns is None else self._last_ns
         if now_ns <= last_ns:
             raise TickError(f'stamp {now_ns} ns does not follow stamp {last_ns} ns')

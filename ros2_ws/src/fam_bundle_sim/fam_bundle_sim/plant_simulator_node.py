@@ -2,15 +2,21 @@
 """ROS node of the simulated rig: valve_command in, bundle_state out; it paces the graph."""
 
 import sys
+import threading
 import time
 
 import numpy as np
 from rclpy.duration import Duration
+from std_srvs.srv import Trigger
 
-from fam_bundle_model.parameters import seconds
+from fam_bundle_model.hydraulics import TO_TANK
+from fam_bundle_model.parameters import Configuration, seconds
 from fam_bundle_msgs.msg import BundleState, ValveCommand
-from fam_bundle_node.loop_node import LoopNode, run_node
-from fam_bundle_node.ticks import TickError, check_finite, check_length
+from fam_bundle_node.command_watch import CommandWatch
+from fam_bundle_node.loop_node import LoopNode
+from fam_bundle_node.pacing import Lockstep, Pacing, Periodic
+from fam_bundle_node.run import run_node
+from fam_bundle_node.ticks import TickError
 from fam_bundle_sim.plant import plant, plant_step, resting_state, truth
 from fam_bundle_sim.sensors import measure, noise_samples, sensors
 
@@ -24,90 +30,204 @@ GROUPS = (
     'sensors',
     'simulation',
     'reference',
-    'run',
 )
 
 LAST_MESSAGES = Duration(seconds=5)
 MATCHING_PERIOD = 0.02  # s between two looks at who listens
+WATCH_PERIOD = 0.02  # s between two looks at how the run goes
+SAMPLES = 4096  # whose times are kept for their answers
+
+
+def make_pacing(configuration: Configuration) -> Pacing:
+    """Return what paces the plant."""
+    run = configuration.run
+    if run.pace == 'lockstep':
+        return Lockstep()
+    return Periodic(configuration.period_ns(), round(run.busy_tail * 1e9))
 
 
 class PlantSimulator(LoopNode):
-    """Takes tick k + 1 only when the valve command of tick k has come (lock-step).
+    """Takes a step when its pacing says so, under the newest valve command.
 
-    It ends by itself after the run's last tick.
+    Tick 0 is published once everybody listens; its answer proves the loop closed and starts the
+    pacing. The node ends by itself after the run's last tick.
     """
 
     def __init__(self) -> None:
-        """Rest until the loop is complete, then publish tick 0."""
+        """Rest until the loop is complete."""
         super().__init__('plant_simulator', GROUPS)
-        units = len(self.configuration.fam.count)
+        units = self.motor_units()
         self.rig = plant(self.configuration)
-        self.state = resting_state(self.configuration, self.rig)
+        self.state_vector = resting_state(self.configuration, self.rig)
         self.sensors = sensors(self.configuration.sensors, units)
         self.noise = noise_samples(self.configuration.sensors, units)
         self.mu_pressure = np.zeros(units)
-        self.ticks = self.configuration.ticks()
-        self.step_ns = self.configuration.period_ns()
-        self.tick = 0
-        self.started_at = self.published_at = time.monotonic()
+        self.period_ns = self.configuration.period_ns()
+        self.periods = self.configuration.ticks()
+        self.period = 0  # since the start of the run
+        self.tick = -1  # of the newest sample
+        self.started_at = self.published_at = time.monotonic_ns()
+        self.sampled_at = [0] * SAMPLES  # when (ns), by tick
+        self.spool = np.zeros(units)
+        self.answered = -1  # tick of the newest command
+        limit = round(self.configuration.run.command_timeout * 1e9 / self.period_ns)
+        self.watch = CommandWatch(max(limit, 1))
+        self.shown = 'running'
+        self.failed = ''  # why a step went wrong
+        self.lock = threading.Lock()  # command and watch are shared with the pacing's thread
+        self.pacing = make_pacing(self.configuration)
         self.publisher = self.loop_publisher(BundleState, 'bundle_state')
         self.loop_subscription(ValveCommand, 'valve_command', self.on_valve_command)
-        self.advance(self.state.copy(), np.zeros(units))  # compiles the plant
-        self.timer = self.create_timer(MATCHING_PERIOD, self.start)
+        self.create_service(Trigger, '~/reset_fault', self.on_reset_fault)
+        self.advance(self.state_vector.copy(), np.zeros(units))  # compiles the plant
+        self.starter = self.create_steady_timer(MATCHING_PERIOD, self.start)
 
     def start(self) -> None:
-        """Publish tick 0 once everybody listens, and begin to watch for answers."""
+        """Publish tick 0 once everybody listens, and begin to look after the run."""
         present, wanted = self.publisher.get_subscription_count(), self.configuration.run.listeners
         if present < wanted:
             timeout = self.configuration.run.start_timeout
-            if time.monotonic() - self.started_at > timeout:
+            if time.monotonic_ns() - self.started_at > timeout * 1e9:
                 self.fail(f'bundle_state: {present} of {wanted} listeners after {timeout:g} s')
             return
-        self.timer.cancel()
-        self.get_logger().info(f'running {self.ticks} ticks in lock-step')
-        self.started_at = time.monotonic()
-        self.publish_state()
-        self.create_timer(0.5, self.watch)
+        self.starter.cancel()
+        how = 'in real time' if self.realtime else 'in lock-step'
+        self.get_logger().info(f'running {self.periods} ticks {how}')
+        self.started_at = time.monotonic_ns()
+        self.publish_state(self.started_at)
+        self.create_steady_timer(WATCH_PERIOD, self.look_after)
 
-    def watch(self) -> None:
-        """End the run when an answer stays away."""
-        timeout = self.configuration.run.answer_timeout
-        if time.monotonic() - self.published_at > timeout:
-            self.fail(f'valve_command: tick {self.tick} has not come within {timeout:g} s')
+    def look_after(self) -> None:
+        """End a run that stands still or is over; tell at once when its state changes."""
+        silence = (time.monotonic_ns() - self.published_at) * 1e-9
+        run = self.configuration.run
+        over = self.realtime and self.period >= self.periods
+        waits = not self.realtime or self.answered < 0
+        if self.failed:
+            self.fail(self.failed)
+        elif over and (self.answered == self.tick or silence > run.command_timeout):
+            self.finish()
+        elif waits and silence > run.answer_timeout:
+            timeout = f'{run.answer_timeout:g} s'
+            self.fail(f'valve_command: tick {self.tick} has not come within {timeout}')
+        if self.state() != self.shown:
+            self.shown = self.state()
+            self.get_logger().warning(self.shown)
+            self.report()
 
-    def publish_state(self) -> None:
-        """Measure and publish the current tick."""
-        true = truth(self.rig, self.state, self.mu_pressure)
-        seen = measure(self.sensors, true, next(self.noise), self.mu_pressure)
-        stamp_ns = self.tick * self.step_ns
-        message = BundleState(
-            tick=self.tick, mu_pressure=self.mu_pressure.tolist(), **seen._asdict()
-        )
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
-        message.header.frame_id = 'bundle'
-        self.publisher.publish(message)
-        self.published_at = time.monotonic()
+    def state(self) -> str:
+        """Return 'running', or why the plant is safe."""
+        return self.watch.state()
 
     def on_valve_command(self, command: ValveCommand) -> None:
-        """Advance the plant by one tick under the command of this tick."""
-        if command.tick != self.tick:
-            raise TickError(f'valve_command: tick {command.tick} came, expected {self.tick}')
-        check_length('valve_command', command.tick, command.spool, len(self.mu_pressure))
-        check_finite('valve_command', command.tick, command.spool)
-        self.tick += 1
-        if self.tick == self.ticks:
-            elapsed = time.monotonic() - self.started_at
-            self.get_logger().info(f'ran {self.ticks} ticks in {elapsed:.4f} s')
-            self.publisher.wait_for_all_acked(LAST_MESSAGES)  # a recorder may be behind
-            self.succeed()
+        """Hold the command; go on where the pacing waits for it."""
+        if not self.is_answer(command):
             return
-        self.advance(self.state, np.clip(command.spool, -1.0, 1.0))
-        self.publish_state()
+        first = self.answered < 0
+        with self.lock:
+            self.answered = command.tick
+            self.watch.answer(command.tick)
+            self.spool = np.clip(command.spool, -1.0, 1.0)
+            if command.vent:
+                self.watch.latch('pressure_controller asks for the safe state')
+        self.meter.answered(command.tick, self.sampled_at[command.tick % SAMPLES])
+        if first:
+            self.pacing.start(self.step, self.on_failed_step)
+        else:
+            self.pacing.answered()
+
+    def is_answer(self, command: ValveCommand) -> bool:
+        """Return whether a command answers a sample that waits for it, and count it if not."""
+        if not self.realtime:
+            if command.tick != self.tick:
+                raise TickError(f'valve_command: tick {command.tick} came, expected {self.tick}')
+            return True
+        if command.tick > self.tick:
+            raise TickError(f'valve_command: tick {command.tick} came before its sample')
+        if command.tick <= self.answered:
+            again = command.tick == self.answered
+            self.counts.duplicate += again
+            self.counts.out_of_order += not again
+            return False
+        self.counts.missing += command.tick - self.answered - 1
+        self.counts.late += command.tick < self.tick
+        return True
+
+    def step(self, periods: int) -> None:
+        """Advance by ``periods``, more than 1 after an overrun, and publish the next sample."""
+        self.meter.skipped(periods)
+        with self.lock:
+            safe, spool = self.watch.safe, self.spool
+            if self.realtime:
+                self.watch.next_sample(self.tick + 1, periods)
+        self.period += periods
+        if self.period >= self.periods:
+            self.end()
+            return
+        vented = np.full(len(spool), TO_TANK)
+        for passed in range(periods):
+            # A hold-up longer than the time-out: as a rig's watchdog would do.
+            held = not safe and passed < self.watch.limit
+            self.advance(self.state_vector, spool if held else vented)
+        self.publish_state(self.pacing.due if self.realtime else time.monotonic_ns())
+
+    def publish_state(self, steady_time: int) -> None:
+        """Measure and publish the next sample, which was due at ``steady_time`` (ns)."""
+        self.tick += 1
+        self.published_at = self.sampled_at[self.tick % SAMPLES] = steady_time
+        true = truth(self.rig, self.state_vector, self.mu_pressure)
+        seen = measure(self.sensors, true, next(self.noise), self.mu_pressure)
+        message = BundleState(
+            tick=self.tick,
+            steady_time=steady_time,
+            safe=self.watch.safe,
+            mu_pressure=self.mu_pressure.tolist(),
+            **seen._asdict(),
+        )
+        stamp = message.header.stamp
+        stamp.sec, stamp.nanosec = divmod(self.period * self.period_ns, 1_000_000_000)
+        message.header.frame_id = 'bundle'
+        self.publisher.publish(message)
+
+    def end(self) -> None:
+        """Take no further step; in real time the last answer may still come."""
+        self.pacing.stop()
+        if not self.realtime:
+            self.finish()
+
+    def finish(self) -> None:
+        """Say how fast the run was, and end the node."""
+        elapsed = (time.monotonic_ns() - self.started_at) * 1e-9
+        self.get_logger().info(f'ran {self.tick + 1} ticks in {elapsed:.4f} s')
+        self.report()
+        self.publisher.wait_for_all_acked(LAST_MESSAGES)  # a recorder may be behind
+        self.succeed()
+
+    def on_failed_step(self, error: BaseException) -> None:
+        """End the node after an error in the pacing's thread."""
+        self.failed = f'{type(error).__name__}: {error}'
+
+    def on_reset_fault(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """End a latched fault."""
+        with self.lock:
+            response.message = self.watch.fault or 'no fault'
+            response.success = bool(self.watch.fault)
+            self.watch.reset()
+        return response
+
+    def get_trouble(self, reason: str) -> None:
+        """Latch a fault: three commands in a row could not be used."""
+        with self.lock:
+            self.watch.latch(reason)
 
     def advance(self, state: np.ndarray, spool: np.ndarray) -> None:
-        """Advance ``state`` in place by one tick."""
+        """Advance ``state`` in place by one period."""
         substeps = self.configuration.simulation.substeps
-        plant_step(self.rig, state, spool, seconds(self.step_ns), substeps)
+        plant_step(self.rig, state, spool, seconds(self.period_ns), substeps)
+
+    def close(self) -> None:
+        """End the pacing's thread."""
+        self.pacing.stop()
 
 
 def main() -> None:

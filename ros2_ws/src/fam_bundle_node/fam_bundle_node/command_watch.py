@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Decides whether the valves may follow the newest command. Pure Python.
+
+Owned by whoever has the valves, the plant simulator or the hardware bridge.
+"""
+
+
+class CommandWatch:
+    """Safe while commands stay away; latched after a fault.
+
+    Counts samples, not time, so that a schedule which was itself held up does not blame the
+    controllers.
+    """
+
+    def __init__(self, limit: int) -> None:
+        """Go safe when the answers fall ``limit`` samples behind.
+
+        As many samples in a row with answers that do not end it.
+        """
+        self.limit = limit
+        self.fault = ''
+        self.reason = ''
+        self._answered = -1
+        self._in_time = 0
+
+    @property
+    def safe(self) -> bool:
+        """Whether the valves must be open to the tank."""
+        return bool(self.fault or self.reason)
+
+    def state(self) -> str:
+        """Return 'running', or why it is safe."""
+        if self.fault:
+            return f'fault: {self.fault}; reset with ~/reset_fault'
+        return f'safe: {self.reason}' if self.reason else 'running'
+
+    def answer(self, tick: int) -> None:
+        """Note the answer to sample ``tick``, the newest so far."""
+        self._answered = tick
+
+    def next_sample(self, tick: int, periods: int) -> None:
+        """Decide before sample ``tick`` is taken, ``periods`` periods after the last one."""
+        answered = tick - 1 - self._answered < self.limit
+        self._in_time = self._in_time + 1 if answered else 0
+        if periods > self.limit:
+            self._go_safe(f'the schedule was held up for {periods} periods before tick {tick}')
+        elif not answered:
+            self._go_safe(f'valve_command: no answer since tick {self._answered}')
+        elif self._in_time >= self.limit:
+            self.reason = ''
+
+    def latch(self, reason: str) -> None:
+        """Go safe for good; the first reason stays."""
+        self.fault = self.fault or reason
+
+    def reset(self) -> None:
+        """End a latched fault; the next answers in a row end the safe state."""
+        if self.fault:
+            self._go_safe(f'{self.fault}; reset, waiting for commands')
+        self.fault = ''
+
+    def _go_safe(self, reason: str) -> None:
+        self.reason = reason
+        self._in_time = 0

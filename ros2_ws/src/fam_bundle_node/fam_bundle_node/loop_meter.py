@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well a node keeps up: rate, latencies, CPU time, and what went wrong. No ROS."""
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from fam_bundle_node.ticks import TickCounts
+
+NANOSECONDS = 1e-9
+# A first sample of another age was stamped by another machine's clock.
+OLDEST_FIRST_SAMPLE = 5_000_000_000  # ns
+
+
+class LoopReport(NamedTuple):
+    """One interval of a node; times in s, counts since its start."""
+
+    interval: float
+    ticks: int
+    rate: float
+    latency_p50: float
+    latency_p99: float
+    latency_max: float
+    cpu_time_per_tick: float
+    cpu_share: float
+
+
+class LoopMeter:
+    """Takes the time of each answer; ``report`` sums up since the report before."""
+
+    def __init__(
+        self,
+        clock: Callable[[], int] = time.monotonic_ns,
+        cpu: Callable[[], int] = time.process_time_ns,
+    ) -> None:
+        """Use ``clock`` and ``cpu`` (both ns)."""
+        self.counts = TickCounts()
+        self.ticks = self.overruns = self.skipped_periods = 0
+        self._clock, self._cpu = clock, cpu
+        self._latencies: list[int] = []
+        self._begin, self._cpu_begin, self._ticks_begin = clock(), cpu(), 0
+        self._comparable: bool | None = None
+
+    def age(self, steady_time: int) -> int | None:
+        """Return how long ago ``steady_time`` was (ns), or None if it is another machine's."""
+        age = self._clock() - steady_time
+        if self._comparable is None:
+            self._comparable = 0 <= age < OLDEST_FIRST_SAMPLE
+        return age if self._comparable else None
+
+    def answered(self, tick: int, steady_time: int) -> None:
+        """Count a tick whose sample was taken at ``steady_time`` (ns).
+
+        Tick 0 has no latency: it waits until the loop has closed.
+        """
+        self.ticks += 1
+        age = self.age(steady_time)
+        if age is not None and tick > 0:
+            self._latencies.append(age)
+
+    def skipped(self, periods: int) -> None:
+        """Note that a step came ``periods`` periods after the last; more than 1 is an overrun."""
+        if periods > 1:
+            self.overruns += 1
+            self.skipped_periods += periods - 1
+
+    def report(self) -> LoopReport:
+        """Return the sums since the last report and begin anew."""
+        latencies, self._latencies = self._latencies, []
+        now, cpu, ticks = self._clock(), self._cpu(), self.ticks
+        interval = max(now - self._begin, 1) * NANOSECONDS
+        done = ticks - self._ticks_begin
+        spent = (cpu - self._cpu_begin) * NANOSECONDS
+        self._begin, self._cpu_begin, self._ticks_begin = now, cpu, ticks
+        found = np.array(latencies or [np.nan]) * NANOSECONDS
+        p50, p99, largest = np.percentile(found, (50.0, 99.0, 100.0)).tolist()
+        return LoopReport(
+            interval,
+            ticks,
+            done / interval,
+            p50,
+            p99,
+            largest,
+            spent / done if done else 0.0,
+            spent / interval,
+        )

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs nodes of the loop in this process until they are done: executor, tuning, exit status."""
+
+import contextlib
+import sys
+from collections.abc import Callable, Sequence
+
+import rclpy
+from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.task import Future
+
+from fam_bundle_model.schema import ConfigurationError
+from fam_bundle_node.loop_node import LoopNode
+from fam_bundle_node.tuning import tune
+
+INTERRUPTED = 130
+
+
+def make_executor(kind: str = 'events') -> Executor:
+    """Return the executor ``kind``: ``events``, where rclpy has it, or ``single_threaded``."""
+    from rclpy.executors import SingleThreadedExecutor
+
+    if kind == 'single_threaded':
+        return SingleThreadedExecutor()
+    try:
+        from rclpy.experimental.events_executor import EventsExecutor
+    except ImportError:
+        return SingleThreadedExecutor()
+    return EventsExecutor()
+
+
+def run_node(make_node: Callable[[], LoopNode]) -> int:
+    """Run one node until it is done or told to stop, and return its exit status."""
+    return run_nodes([make_node])
+
+
+def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
+    """Run nodes on one executor until the first is done or told to stop; return its exit status.
+
+    0 when it has done its work, 1 after a failure, 2 for a bad configuration, 130 when it was told
+    to stop before.
+    """
+    try:
+        rclpy.init()
+        nodes = [make_node() for make_node in makers]
+    except rclpy_implementation.RCLError as error:  # a parameter file that is missing or no YAML
+        print(' '.join(str(error).split()), file=sys.stderr)
+        return 2
+    except ConfigurationError as error:
+        print(f'{error} (parameters: --ros-args --params-file FILE)', file=sys.stderr)
+        rclpy.try_shutdown()
+        return 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        rclpy.try_shutdown()
+        return INTERRUPTED
+    done = first_done(nodes)
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+        spin(nodes, done)
+    for node in nodes:
+        node.close()
+    status: int = done.result() if done.done() else INTERRUPTED
+    rclpy.try_shutdown()
+    return status
+
+
+def spin(nodes: Sequence[LoopNode], done: Future) -> None:
+    """Tune the process as the first node's parameters say, and run all until ``done``."""
+    process, pace = nodes[0].configuration.process, nodes[0].configuration.run.pace
+    executor = make_executor(process.executor)
+    for node in nodes:
+        executor.add_node(node)
+    for warning in tune(process, pace):
+        nodes[0].get_logger().warning(warning)
+    # A finite wait: an unbounded one answers no signal with the events executor.
+    while rclpy.ok() and not done.done():
+        executor.spin_until_future_complete(done, timeout_sec=1.0)
+
+
+def first_done(nodes: Sequence[LoopNode]) -> Future:
+    """Return a future of the exit status of the node that is done first."""
+    first: Future = Future()
+
+    def pass_on(ended: Future) -> None:
+        if not first.done():
+            first.set_result(ended.result())
+
+    for node in nodes:
+        node.done.add_done_callback(pass_on)
+    return first
