@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: ``./fam experiment``, ``./fam demo`` and ``./fam bench``."""
+"""The command line: ``./fam experiment``, ``./fam demo``, ``./fam bench`` and ``./fam top``."""
 
 import argparse
+import math
 import signal
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from fam_bundle_bringup.domain_marker import domain_number
 from fam_bundle_bringup.experiment import (
     PACES,
     RESULTS,
@@ -39,6 +41,7 @@ def parser() -> Parser:
     _add_common(demo, Path('runs/demo'))
     bench = commands.add_parser('bench', help='how fast the loop runs on this machine')
     _add_common(bench, Path('runs/bench'))
+    _add_top(commands)
     return top
 
 
@@ -67,13 +70,56 @@ def _add_experiment(commands: Any) -> None:
         '--pace',
         choices=PACES,
         default='lockstep',
-        help='through the node graph, or the same loop in one process (%(default)s)',
+        help='through the node graph, paced by each other or by a clock, or the same loop in one '
+        'process without ROS (%(default)s)',
+    )
+    experiment.add_argument(
+        '--composed', action='store_true', help='all nodes of the graph in one process'
     )
     experiment.add_argument('--reference', metavar='sine', help='waveform of the strain reference')
     experiment.add_argument('--amplitude', metavar='STRAIN', help='half of its peak strain')
     experiment.add_argument('--frequency', metavar='HZ', help='its frequency')
     experiment.add_argument('--cycles', metavar='N', help='how many cycles to run')
     _add_common(experiment, Path('runs/experiment'))
+
+
+def _add_top(commands: Any) -> None:
+    top = commands.add_parser('top', help='live view of how every node keeps up')
+    top.add_argument(
+        '--domain',
+        type=_argument(domain_number),
+        metavar='N',
+        help='DDS domain (default: ROS_DOMAIN_ID, else that of the running experiment)',
+    )
+    top.add_argument(
+        '--seconds',
+        type=_argument(_seconds),
+        default=math.inf,
+        metavar='S',
+        help='end after so many seconds (default: at Ctrl-C)',
+    )
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not seconds > 0.0:
+        raise ConfigurationError(f'{text!r}: must be a number > 0')
+    return seconds
+
+
+def _argument(convert: Callable[[str], Any]) -> Callable[[str], Any]:
+    """Let the parser refuse in the words of ``convert``."""
+
+    def converted(text: str) -> Any:
+        try:
+            return convert(text)
+        except ConfigurationError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return converted
 
 
 def changes_of(options: argparse.Namespace) -> Mapping[str, Mapping[str, Any]]:
@@ -100,7 +146,9 @@ def run_experiment_command(options: argparse.Namespace, configuration: Configura
 
     scheme = configuration.recruitment.scheme
     with progress_bar(f'{scheme}, {options.pace}', configuration.ticks()) as progress:
-        result = run_experiment(configuration, options.pace, options.out, progress)
+        result = run_experiment(
+            configuration, options.pace, options.out, progress, composed=options.composed
+        )
     metrics = result.metrics
     window = f'{metrics["metrics_from"]:g} to {metrics["metrics_to"]:g} s'
     print(f'{scheme}: {metrics["ticks"]} ticks; over {window}:')
@@ -125,6 +173,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Every exit unwinds, so that no process is left behind.
     signal.signal(signal.SIGTERM, _terminate)
     try:
+        if options.command == 'top':
+            from fam_bundle_bringup.top import run_top
+
+            run_top(options.domain, options.seconds)
+            return 0
         results = RESULTS if options.command == 'experiment' else ()
         changes = changes_of(options) if options.command == 'experiment' else {}
         config = options.config or default_configuration()

@@ -45,22 +45,29 @@ class NodeGroup:
         self._logs = logs
         self._nodes: list[NodeProcess] = []
 
-    def start(self, name: str, command: Sequence[str]) -> None:
-        """Start one node."""
+    def start(
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+    ) -> 'subprocess.Popen[bytes]':
+        """Start one node, with ``environment`` on top of the group's, and return its process."""
         self._logs.mkdir(parents=True, exist_ok=True)
         log = self._logs / f'{name}.log'
-        with log.open('wb') as output:
+        again = any(node.name == name for node in self._nodes)
+        with log.open('ab' if again else 'wb') as output:
             process = subprocess.Popen(
                 command,
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
-                env=self._environment,
+                env={**self._environment, **(environment or {})},
                 # Ctrl-C reaches the runner alone, which ends the nodes in its own order.
                 start_new_session=True,
                 preexec_fn=_end_with_parent,
             )
         self._nodes.append(NodeProcess(name, process, log))
+        return process
 
     def finished(self, name: str) -> bool:
         """Return whether the node ``name`` has ended well.
@@ -82,6 +89,7 @@ class NodeGroup:
         """End every node: first asked, then killed."""
         for node in self._nodes:
             with contextlib.suppress(ProcessLookupError):
+                node.process.send_signal(signal.SIGCONT)  # one that was stopped hears nothing
                 node.process.send_signal(signal.SIGINT)
         deadline = time.monotonic() + STOP_TIMEOUT
         for node in self._nodes:

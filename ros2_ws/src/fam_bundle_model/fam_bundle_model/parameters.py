@@ -304,7 +304,18 @@ def make_configuration(
         check_fam(configuration.fam)
     if configuration.recruitment is not None:
         check_recruitment(configuration.recruitment)
+    if configuration.run is not None and configuration.simulation is not None:
+        check_run(configuration.run, configuration.simulation)
     return configuration
+
+
+def check_run(run: RunParameters, simulation: SimulationParameters) -> None:
+    """Raise ConfigurationError where every answer would come too late."""
+    if run.command_timeout < 2.0 * simulation.period:
+        raise ConfigurationError(
+            f'run.command_timeout = {run.command_timeout:g} s: must be >= '
+            f'{2.0 * simulation.period:g} s, two periods'
+        )
 
 
 def check_fam(fam: FamParameters) -> None:

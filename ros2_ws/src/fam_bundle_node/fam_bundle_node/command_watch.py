@@ -13,14 +13,15 @@ class CommandWatch:
     """
 
     def __init__(self, limit: int) -> None:
-        """Go safe when the answers fall ``limit`` samples behind.
+        """Go safe when the newest answer is ``limit`` samples old; ``limit`` is 2 or more.
 
-        As many samples in a row with answers that do not end it.
+        A new answer at each of as many samples in a row ends it. Not safe at first: its owner
+        begins when the loop has closed.
         """
         self.limit = limit
         self.fault = ''
         self.reason = ''
-        self._answered = -1
+        self._answered = self._answered_before = -1
         self._in_time = 0
 
     @property
@@ -40,8 +41,10 @@ class CommandWatch:
 
     def next_sample(self, tick: int, periods: int) -> None:
         """Decide before sample ``tick`` is taken, ``periods`` periods after the last one."""
-        answered = tick - 1 - self._answered < self.limit
-        self._in_time = self._in_time + 1 if answered else 0
+        answered = tick - self._answered < self.limit
+        came = self._answered > self._answered_before
+        self._in_time = self._in_time + 1 if came else 0
+        self._answered_before = self._answered
         if periods > self.limit:
             self._go_safe(f'the schedule was held up for {periods} periods before tick {tick}')
         elif not answered:

@@ -56,8 +56,8 @@ class LoopMeter:
         Tick 0 has no latency: it waits until the loop has closed.
         """
         self.ticks += 1
-        age = self.age(steady_time)
-        if age is not None and tick > 0:
+        age = self.age(steady_time) if tick > 0 else None
+        if age is not None:
             self._latencies.append(age)
 
     def skipped(self, periods: int) -> None:

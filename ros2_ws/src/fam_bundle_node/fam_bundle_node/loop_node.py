@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every node of the loop shares: parameters, admission of messages, statistics, errors."""
 
+import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -22,6 +23,8 @@ from fam_bundle_node.ticks import Strikes, TickCounts, TickError, TickFilter, Ti
 # Parameter groups that every node of the loop declares.
 COMMON = ('run', 'process')
 REPORT_PERIOD = 1.0  # s
+LOOK_PERIOD = 0.05  # s between two looks at how the node does
+SILENCE = 0.2  # s without a tick, after which a controller says what it waits for
 STALE = 5.0  # command time-outs; nobody waits for the answer to an older sample
 FUTURE = -1_000_000  # ns; a sample that is stamped further ahead than this was not taken
 
@@ -30,7 +33,7 @@ class LoopNode(Node):
     """A node that publishes and consumes one message per tick.
 
     In lock-step a message that is missing, out of order or bad ends the node. In real time it is
-    counted and dropped, and three in a row are a trouble that lasts until they have ceased.
+    counted and dropped, and three close together are a trouble until they have ceased.
     """
 
     def __init__(self, name: str, groups: Iterable[str]) -> None:
@@ -49,7 +52,8 @@ class LoopNode(Node):
             raise
         self.realtime = self.configuration.run.pace == 'realtime'
         self.statistics = StatisticsPublisher(self, self.meter)
-        self.create_steady_timer(REPORT_PERIOD, self.report)
+        self._shown, self._reported_at = 'running', time.monotonic()
+        self.create_steady_timer(LOOK_PERIOD, self.look_after)
 
     @property
     def counts(self) -> TickCounts:
@@ -115,14 +119,15 @@ class LoopNode(Node):
 
     def _is_fresh(self, sample: Any) -> bool:
         """Return whether a sample is of now, and count it if it is late."""
-        age = self.meter.age(sample.steady_time)
-        if age is None:
-            return True
-        if age < FUTURE:
-            raise TickError(f'bundle_state: tick {sample.tick} is {-age} ns ahead of the clock')
-        late = age > STALE * self.configuration.run.command_timeout * 1e9
         if sample.tick == 0:  # waits for its answer, but must not be of a run that was before
             late = sample.steady_time <= self._newest
+        else:
+            age = self.meter.age(sample.steady_time)
+            if age is None:
+                return True
+            if age < FUTURE:
+                raise TickError(f'bundle_state: tick {sample.tick} is {-age} ns in the future')
+            late = age > STALE * self.configuration.run.command_timeout * 1e9
         self.counts.late += late
         if not late:
             self._newest = sample.steady_time
@@ -133,18 +138,28 @@ class LoopNode(Node):
         return len(self.configuration.fam.count)
 
     def get_trouble(self, reason: str) -> None:
-        """Note a fault: three messages in a row could not be used."""
+        """Note a fault: three messages could not be used."""
         if not self.trouble:
             self.trouble = reason
             self.get_logger().error(reason)
-            self.report()
 
     def state(self) -> str:
         """Return 'running', or why this node is not."""
         return self.trouble or 'running'
 
+    def look_after(self) -> None:
+        """Report once a second, and at once when the state changes."""
+        state = self.state()
+        if state == self._shown and time.monotonic() - self._reported_at < REPORT_PERIOD:
+            return
+        if state != self._shown:
+            self.get_logger().warning(state)
+        self._shown = state
+        self.report()
+
     def report(self) -> None:
         """Publish how well this node keeps up."""
+        self._reported_at = time.monotonic()
         self.statistics.publish(self.state())
 
     def succeed(self) -> None:
@@ -169,7 +184,7 @@ class Controller(LoopNode):
         """Know no sample yet."""
         super().__init__(name, groups)
         self.stamps = StampClock(self.configuration.period_ns())
-        self._reported = 0
+        self._ticks, self._tick_at = 0, 0.0
 
     def restart(self) -> None:
         """Bring the law to its start, from which it sets in without a bump."""
@@ -182,16 +197,18 @@ class Controller(LoopNode):
         output is not applied must not wind up. Raises TickError when time stands still.
         """
         gap = self.stamps.gap(sample.header.stamp)
-        if sample.tick == 0 or sample.safe or gap > self.configuration.run.command_timeout:
+        steady = 0.0 <= gap <= self.configuration.run.command_timeout
+        if sample.tick == 0 or sample.safe or not steady:
             self.stamps.restart()
             self.restart()
         return self.stamps.since_last(sample.header.stamp)
 
     def state(self) -> str:
         """Return 'running', or why this node is not."""
-        if not self.trouble and self.meter.ticks == self._reported:
+        if self.meter.ticks != self._ticks:
+            self._ticks, self._tick_at = self.meter.ticks, time.monotonic()
+        if not self.trouble and time.monotonic() - self._tick_at > SILENCE:
             return f'waiting for {self.missing()}'
-        self._reported = self.meter.ticks
         return super().state()
 
     def missing(self) -> str:

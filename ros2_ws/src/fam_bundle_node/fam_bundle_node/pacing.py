@@ -18,14 +18,21 @@ Step = Callable[[int], None]
 class Pacing(Protocol):
     """Drives the steps of a loop."""
 
+    # When the newest step was due (ns), or None where no clock says so.
+    due: int | None
+
     def start(self, step: Step, failed: Callable[[BaseException], None]) -> None:
-        """Begin to call ``step``; ``failed`` is told what a step raised, and no more follow."""
+        """Begin to call ``step``.
+
+        A pacing with a thread of its own tells ``failed`` what a step raised and ends; one
+        without lets it rise to whoever called.
+        """
 
     def answered(self) -> None:
         """Note that the answer to the newest tick has come."""
 
     def stop(self) -> None:
-        """Call no further step; return when the last one has ended."""
+        """Call no further step; wait up to a second for the last one to end."""
 
 
 class Schedule:
@@ -64,6 +71,8 @@ def wait_until(due: int, busy_tail: int, clock: Clock, sleep: Sleep) -> int:
 class Lockstep:
     """Takes the next step when the answer to the last one has come, in the same thread."""
 
+    due: int | None = None
+
     def __init__(self) -> None:
         """Stand still."""
         self._step: Step | None = None
@@ -85,6 +94,8 @@ class Lockstep:
 
 class _Threaded:
     """Steps in a thread of its own, one for each return of ``wait``."""
+
+    due: int | None = None
 
     def __init__(self, wait: Callable[[], int]) -> None:
         self._wait = wait
@@ -135,7 +146,6 @@ class Periodic(_Threaded):
         self._period, self._busy_tail = period, busy_tail
         self._clock, self._sleep = clock, sleep
         self._schedule = Schedule(0, period)
-        self.due = 0
 
     def start(self, step: Step, failed: Callable[[BaseException], None]) -> None:
         """Take the first step in one period."""

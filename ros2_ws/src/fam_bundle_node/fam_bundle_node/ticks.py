@@ -55,15 +55,16 @@ class TickFilter:
     def admit(self, tick: int) -> bool:
         """Return whether ``tick`` is to be used.
 
-        A jump, back or far ahead, is believed when ``CONFIRMED`` ticks in a row say so: one
-        stray message must not blind the loop to all that follow. Tick 0 begins a new run.
+        A jump, back or far ahead, is believed when ``CONFIRMED`` rising ticks in a row say so:
+        one stray message must not blind the loop to all that follow. Tick 0 begins a new run.
         """
-        step = 1 if self._last is None or tick == 0 != self._last else tick - self._last
+        step = 1 if self._last is None or tick == 0 else tick - self._last
         if step == 0:
             self._counts.duplicate += 1
             return False
         if not 1 <= step <= LARGEST_GAP:
-            self._seen = self._seen + 1 if tick == self._candidate + 1 else 1
+            rises = 1 <= tick - self._candidate <= LARGEST_GAP
+            self._seen = self._seen + 1 if rises else 1
             self._candidate = tick
             if self._seen < CONFIRMED:
                 self._counts.out_of_order += 1
@@ -82,11 +83,19 @@ class TickJoin:
         self._counts = counts
         self._strict = strict
         self._open: dict[int, dict[str, Any]] = {}
+        self._opened: dict[int, int] = {}  # how many ticks were complete by then
+        self._completed = 0
         self._done: int | None = None
 
-    def _begin(self) -> None:
-        self._open.clear()
-        self._done = None
+    def _is_new_run(self, topic: str, tick: int) -> bool:
+        """Return whether a tick that has been there begins a new run: tick 0 on any topic.
+
+        And any tick on the first topic, whose ticks were checked before.
+        """
+        if tick == 0:
+            been = any(topic in held for held in self._open.values())
+            return been or self._done is not None
+        return topic == self._topics[0] and self._done is not None and tick < self._done
 
     def add(self, topic: str, message: Any) -> tuple[Any, ...] | None:
         """Return the messages of a tick in the order of the topics once all are there.
@@ -96,8 +105,9 @@ class TickJoin:
         Raises TickError, if strict, when ``message`` is of another tick than those that wait.
         """
         tick: int = message.tick
-        if tick == 0 and self._done:
-            self._begin()
+        if self._is_new_run(topic, tick):
+            self._drop(list(self._open))
+            self._done = None
         if self._strict and self._open and tick not in self._open:
             self._refuse(topic, tick)
         if self._done is not None and tick <= self._done:
@@ -105,22 +115,35 @@ class TickJoin:
             self._counts.late += tick < self._done
             return None
         held = self._open.setdefault(tick, {})
+        self._opened.setdefault(tick, self._completed)
         if topic in held:
             self._counts.duplicate += 1
             return None
         held[topic] = message
         if len(held) < len(self._topics):
             if len(self._open) > WINDOW:
-                del self._open[next(iter(self._open))]
+                self._drop([next(iter(self._open))])
                 self._counts.missing += 1
             return None
         complete = tuple(held[t] for t in self._topics)
-        stale = [other for other in self._open if other <= tick]
-        self._counts.missing += len(stale) - 1
-        for other in stale:
-            del self._open[other]
+        passed = [other for other in self._open if other <= tick]
+        self._counts.missing += len(passed) - 1
+        self._drop(passed)
         self._done = tick
+        self._completed += 1
+        self._drop_strays()
         return complete
+
+    def _drop(self, ticks: list[int]) -> None:
+        for tick in ticks:
+            del self._open[tick], self._opened[tick]
+
+    def _drop_strays(self) -> None:
+        """Drop what came far ahead of its time, lest it be taken for the real one then."""
+        oldest = self._completed - LARGEST_GAP
+        strays = [tick for tick, opened in self._opened.items() if opened < oldest]
+        self._counts.out_of_order += len(strays)
+        self._drop(strays)
 
     def waits_for(self, topic: str) -> tuple[int, list[str]] | None:
         """Return the oldest open tick that ``topic`` has come for, and which topics it lacks."""
@@ -139,10 +162,10 @@ class TickJoin:
 
 
 class Strikes:
-    """Three messages in a row that may not be used are a fault; a few spread out are not."""
+    """Three messages that may not be used are a fault, if few good ones come in between."""
 
     def __init__(self, limit: int = 3, within: int = LARGEST_GAP) -> None:
-        """Call it a fault at ``limit`` strikes ``within`` so many good messages."""
+        """Call it a fault at ``limit`` strikes with at most ``within`` good ones after each."""
         self._limit, self._within = limit, within
         self._count = 0
         self._good = 0

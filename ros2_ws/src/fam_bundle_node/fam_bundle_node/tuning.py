@@ -5,7 +5,9 @@ Linux. Scheduling is set for every thread of the process, for the middleware's e
 nodes know their parameters.
 """
 
+import contextlib
 import ctypes
+import errno
 import gc
 import os
 from collections.abc import Callable
@@ -26,7 +28,8 @@ def threads() -> list[int]:
 def set_policy(policy: int, priority: int = 0) -> None:
     """Put all threads under a scheduling ``policy``; raises OSError when the system refuses."""
     for thread in threads():
-        os.sched_setscheduler(thread, policy, os.sched_param(priority))
+        with contextlib.suppress(ProcessLookupError):  # it has just ended
+            os.sched_setscheduler(thread, policy, os.sched_param(priority))
 
 
 def set_batch_policy() -> None:
@@ -41,8 +44,12 @@ def set_batch_policy() -> None:
 def set_cpus(mask: int) -> None:
     """Keep all threads on the CPUs whose bits are set; raises OSError when the system refuses."""
     cpus = {cpu for cpu in range(mask.bit_length()) if mask >> cpu & 1}
+    absent = cpus - set(range(os.cpu_count() or 1))
+    if absent:
+        raise OSError(errno.EINVAL, f'there is no CPU {min(absent)}')
     for thread in threads():
-        os.sched_setaffinity(thread, cpus)
+        with contextlib.suppress(ProcessLookupError):
+            os.sched_setaffinity(thread, cpus)
 
 
 def lock_memory() -> None:

@@ -34,7 +34,6 @@ GROUPS = (
 
 LAST_MESSAGES = Duration(seconds=5)
 MATCHING_PERIOD = 0.02  # s between two looks at who listens
-WATCH_PERIOD = 0.02  # s between two looks at how the run goes
 SAMPLES = 4096  # whose times are kept for their answers
 
 
@@ -71,8 +70,7 @@ class PlantSimulator(LoopNode):
         self.spool = np.zeros(units)
         self.answered = -1  # tick of the newest command
         limit = round(self.configuration.run.command_timeout * 1e9 / self.period_ns)
-        self.watch = CommandWatch(max(limit, 1))
-        self.shown = 'running'
+        self.watch = CommandWatch(limit)
         self.failed = ''  # why a step went wrong
         self.lock = threading.Lock()  # command and watch are shared with the pacing's thread
         self.pacing = make_pacing(self.configuration)
@@ -94,15 +92,15 @@ class PlantSimulator(LoopNode):
         how = 'in real time' if self.realtime else 'in lock-step'
         self.get_logger().info(f'running {self.periods} ticks {how}')
         self.started_at = time.monotonic_ns()
-        self.publish_state(self.started_at)
-        self.create_steady_timer(WATCH_PERIOD, self.look_after)
+        self.publish_state()
 
     def look_after(self) -> None:
-        """End a run that stands still or is over; tell at once when its state changes."""
+        """End a run that stands still or is over."""
+        super().look_after()
         silence = (time.monotonic_ns() - self.published_at) * 1e-9
         run = self.configuration.run
         over = self.realtime and self.period >= self.periods
-        waits = not self.realtime or self.answered < 0
+        waits = self.tick >= 0 and (not self.realtime or self.answered < 0)
         if self.failed:
             self.fail(self.failed)
         elif over and (self.answered == self.tick or silence > run.command_timeout):
@@ -110,10 +108,6 @@ class PlantSimulator(LoopNode):
         elif waits and silence > run.answer_timeout:
             timeout = f'{run.answer_timeout:g} s'
             self.fail(f'valve_command: tick {self.tick} has not come within {timeout}')
-        if self.state() != self.shown:
-            self.shown = self.state()
-            self.get_logger().warning(self.shown)
-            self.report()
 
     def state(self) -> str:
         """Return 'running', or why the plant is safe."""
@@ -132,6 +126,7 @@ class PlantSimulator(LoopNode):
                 self.watch.latch('pressure_controller asks for the safe state')
         self.meter.answered(command.tick, self.sampled_at[command.tick % SAMPLES])
         if first:
+            self.started_at = time.monotonic_ns()
             self.pacing.start(self.step, self.on_failed_step)
         else:
             self.pacing.answered()
@@ -142,6 +137,9 @@ class PlantSimulator(LoopNode):
             if command.tick != self.tick:
                 raise TickError(f'valve_command: tick {command.tick} came, expected {self.tick}')
             return True
+        if self.answered < 0 and command.tick != 0:
+            self.counts.late += 1  # a run before this one had it
+            return False
         if command.tick > self.tick:
             raise TickError(f'valve_command: tick {command.tick} came before its sample')
         if command.tick <= self.answered:
@@ -169,14 +167,15 @@ class PlantSimulator(LoopNode):
             # A hold-up longer than the time-out: as a rig's watchdog would do.
             held = not safe and passed < self.watch.limit
             self.advance(self.state_vector, spool if held else vented)
-        self.publish_state(self.pacing.due if self.realtime else time.monotonic_ns())
+        self.publish_state(self.pacing.due)
 
-    def publish_state(self, steady_time: int) -> None:
-        """Measure and publish the next sample, which was due at ``steady_time`` (ns)."""
-        self.tick += 1
-        self.published_at = self.sampled_at[self.tick % SAMPLES] = steady_time
+    def publish_state(self, due: int | None = None) -> None:
+        """Measure and publish the next sample, which was due (ns) or is taken now."""
         true = truth(self.rig, self.state_vector, self.mu_pressure)
         seen = measure(self.sensors, true, next(self.noise), self.mu_pressure)
+        steady_time = time.monotonic_ns() if due is None else due
+        self.tick += 1
+        self.published_at = self.sampled_at[self.tick % SAMPLES] = steady_time
         message = BundleState(
             tick=self.tick,
             steady_time=steady_time,

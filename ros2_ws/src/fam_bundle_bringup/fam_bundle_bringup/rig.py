@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The graph in real time under observation: nodes that can be hurt, and all that they said."""
+
+import contextlib
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple
+
+from fam_bundle_bringup.graph import LOOP_LISTENERS, NODES, nodes_in, own_domain
+from fam_bundle_bringup.processes import executable
+from fam_bundle_model.parameters import Configuration, write_yaml
+from fam_bundle_node.stamps import nanoseconds
+
+PACKAGES = {name: package for package, name in NODES}
+PATIENCE = 60.0  # s; only a hang takes that long
+SLICE = 0.02  # s
+
+
+class Seen(NamedTuple):
+    """One message, and when it came (ns, steady)."""
+
+    at: int
+    message: Any
+
+
+class Report(NamedTuple):
+    """One status from /diagnostics: when it came (ns, steady), and its stamp (s, system)."""
+
+    at: int
+    stamp: float
+    node: str
+    error: bool
+    text: str
+    values: Mapping[str, str]
+
+
+class Rig:
+    """Five nodes in real time, each a process of its own, and a listener in this process."""
+
+    def __init__(self, configuration: Configuration, folder: Path) -> None:
+        """Keep the parameters and what the nodes print in ``folder``; start nothing yet."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.configuration = configuration
+        self.parameters = folder / 'parameters.yaml'
+        write_yaml(configuration, self.parameters)
+        self.nodes: dict[str, subprocess.Popen[bytes]] = {}
+        self.seen: dict[str, list[Seen]] = {}
+        self.reports: list[Report] = []
+        self._folder = folder
+        self._stack = contextlib.ExitStack()
+
+    def __enter__(self) -> 'Rig':
+        """Listen, and have no node yet."""
+        try:
+            self._stack.enter_context(own_domain())
+            self.listen, self.node = self._stack.enter_context(self._listening())
+            self.group = self._stack.enter_context(nodes_in(self._folder))
+        except BaseException:
+            self._stack.close()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """End all processes."""
+        self._stack.close()
+
+    @contextlib.contextmanager
+    def _listening(self) -> Iterator[tuple[Callable[[float], None], Any]]:
+        import rclpy
+        from rclpy.node import Node
+        from rclpy.signals import SignalHandlerOptions
+        from rclpy.task import Future
+
+        from fam_bundle_node.run import make_executor
+
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        with contextlib.ExitStack() as stack:
+            stack.callback(rclpy.try_shutdown)
+            node, never = Node('fault_observer'), Future()
+            stack.callback(node.destroy_node)
+            self._subscribe(node)
+            executor = make_executor()
+            stack.callback(executor.shutdown)
+            executor.add_node(node)
+            yield (
+                lambda wait: executor.spin_until_future_complete(never, timeout_sec=wait),
+                node,
+            )
+
+    def _subscribe(self, node: Any) -> None:
+        from diagnostic_msgs.msg import DiagnosticArray
+
+        from fam_bundle_io.trace_recorder_node import TOPICS
+        from fam_bundle_node.qos import RECORDER_SUBSCRIPTION, REPORTS
+
+        for topic, message_type in TOPICS.items():
+            node.create_subscription(
+                message_type, topic, self._keeper(topic), RECORDER_SUBSCRIPTION
+            )
+        node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, REPORTS)
+
+    def _keeper(self, topic: str) -> Callable[[Any], None]:
+        kept = self.seen.setdefault(topic, [])
+
+        def keep(message: Any) -> None:
+            kept.append(Seen(time.monotonic_ns(), message))
+
+        return keep
+
+    def _on_diagnostics(self, array: Any) -> None:
+        for status in array.status:
+            node = status.name.partition(':')[0]
+            values = {pair.key: pair.value for pair in status.values}
+            error = status.level != status.OK and status.message != 'running'
+            stamp = nanoseconds(array.header.stamp) * 1e-9
+            self.reports.append(
+                Report(time.monotonic_ns(), stamp, node, error, status.message, values)
+            )
+
+    def start(
+        self,
+        name: str,
+        environment: Mapping[str, str] | None = None,
+        prefix: tuple[str, ...] = (),
+        alias: str = '',
+    ) -> None:
+        """Start the node ``name``, behind the command ``prefix``; as ``alias`` a second one."""
+        arguments = ['--ros-args', '--params-file', str(self.parameters)]
+        arguments += ['-p', f'run.listeners:={LOOP_LISTENERS + 1}']
+        if alias:
+            arguments += ['-r', f'__node:={alias}']
+        command = [*prefix, executable(PACKAGES[name], name), *arguments]
+        self.nodes[alias or name] = self.group.start(alias or name, command, environment)
+
+    def start_all(self, environment: Mapping[str, str] | None = None) -> None:
+        """Start every node and return when the loop runs in real time."""
+        for name in PACKAGES:
+            self.start(name, environment)
+        self.wait_for(self.runs, 'the loop to run')
+
+    def signal(self, name: str, number: int) -> int:
+        """Send a signal to a node and return when (ns, steady)."""
+        self.nodes[name].send_signal(number)
+        at = time.monotonic_ns()
+        if number == signal.SIGKILL:
+            self.nodes[name].wait()
+        return at
+
+    def wait_for(self, true: Callable[[], bool], what: str, patience: float = PATIENCE) -> float:
+        """Listen until ``true`` and return how long it took (s); raises RuntimeError if never."""
+        begin = time.monotonic()
+        while not true():
+            if time.monotonic() - begin > patience:
+                raise RuntimeError(f'waited {patience:g} s in vain for {what}')
+            self.listen(SLICE)
+        return time.monotonic() - begin
+
+    def runs(self) -> bool:
+        """Return whether commands have been coming and the newest samples are not safe."""
+        states, commands = self.seen['bundle_state'], self.seen['valve_command']
+        recent = time.monotonic_ns() - 500_000_000
+        steady = len(states) > 200 and not any(s.message.safe for s in states[-200:])
+        return bool(steady and commands and min(states[-1].at, commands[-1].at) > recent)
+
+    def safe_after(self, since: int) -> float | None:
+        """Return how long after ``since`` (ns, steady) the first safe sample was due (s)."""
+        for sample in self.seen['bundle_state']:
+            due = sample.message.steady_time
+            if sample.message.safe and due >= since:
+                return float(due - since) * 1e-9
+        return None
+
+    def first_tick_of_this_stretch(self) -> int:
+        """Return the first tick since which the plant has followed commands."""
+        first = 0
+        for sample in reversed(self.seen['bundle_state']):
+            if sample.message.safe or sample.message.tick > first > 0:
+                break
+            first = sample.message.tick
+        return int(first)
+
+    def messages(self, topic: str, since: int, until: int | None = None) -> list[Any]:
+        """Return what came on ``topic`` from ``since`` on (ns, steady), before ``until``."""
+        end = until or time.monotonic_ns()
+        return [s.message for s in self.seen[topic] if since <= s.at < end]
+
+    def reason(self, since: int, *words: str) -> str:
+        """Return the first trouble on /diagnostics since then (ns) that holds one of ``words``."""
+        for report in self.reports:
+            found = any(word in report.text for word in words)
+            if report.at >= since and report.error and found:
+                return f'{report.node}: {report.text}'
+        return ''
+
+    def counted(self, node: str, names: tuple[str, ...]) -> int:
+        """Return the newest sum of a node's counters ``names``."""
+        for report in reversed(self.reports):
+            if report.node == node:
+                return sum(int(float(report.values[name])) for name in names)
+        return 0

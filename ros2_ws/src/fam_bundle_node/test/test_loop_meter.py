@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report says how fast, how late and how dear the ticks of an interval were."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fam_bundle_node.loop_meter import LoopMeter
+
+LONG_AGO = 10**15  # ns, on the fake clock
+MS = 1_000_000  # ns
+
+
+class Clock:
+    """Shows what it is set to."""
+
+    def __init__(self):
+        self.now = LONG_AGO
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def clock():
+    return Clock()
+
+
+@pytest.fixture
+def cpu():
+    return Clock()
+
+
+@pytest.fixture
+def meter(clock, cpu):
+    return LoopMeter(clock, cpu)
+
+
+def answer(meter, clock, *latencies):
+    """Answer one sample every millisecond, each ``latencies`` ns after it was taken."""
+    for latency in latencies:
+        clock.now += MS
+        meter.answered(meter.ticks + 1, clock.now - latency)
+
+
+@settings(deadline=None)
+@given(st.lists(st.integers(0, 5_000 * MS - 1), min_size=1, max_size=50))
+def test_percentiles_are_those_of_the_latencies(latencies):
+    clock = Clock()
+    meter = LoopMeter(clock, Clock())
+    answer(meter, clock, *latencies)
+    report = meter.report()
+    found = report.latency_p50, report.latency_p99, report.latency_max
+    assert found == pytest.approx(np.percentile(latencies, (50, 99, 100)) * 1e-9, rel=1e-12)
+
+
+def test_a_known_spread_has_known_percentiles(meter, clock):
+    answer(meter, clock, *(us * 1000 for us in reversed(range(101))))
+    report = meter.report()
+    assert report.latency_p50 == pytest.approx(50e-6)
+    assert report.latency_p99 == pytest.approx(99e-6)
+    assert report.latency_max == pytest.approx(100e-6)
+
+
+def test_rate_is_ticks_over_elapsed_time(meter, clock):
+    answer(meter, clock, *[0] * 500)
+    clock.now += 1500 * MS
+    report = meter.report()
+    assert report.interval == pytest.approx(2.0)
+    assert report.rate == pytest.approx(250.0)
+
+
+def test_cpu_time_is_told_per_tick_and_as_a_share(meter, clock, cpu):
+    answer(meter, clock, *[0] * 1000)
+    cpu.now += 250 * MS
+    report = meter.report()
+    assert report.cpu_time_per_tick == pytest.approx(250e-6)
+    assert report.cpu_share == pytest.approx(0.25)
+
+
+def test_each_report_is_of_the_time_since_the_one_before(meter, clock, cpu):
+    answer(meter, clock, *[900_000] * 1000)
+    cpu.now += 900 * MS
+    meter.report()
+    answer(meter, clock, *[100_000] * 500)
+    cpu.now += 50 * MS
+    report = meter.report()
+    assert report.interval == pytest.approx(0.5)
+    assert report.rate == pytest.approx(1000.0)
+    assert report.latency_max == pytest.approx(100e-6)
+    assert report.cpu_time_per_tick == pytest.approx(100e-6)
+    assert report.cpu_share == pytest.approx(0.1)
+    assert report.ticks == 1500  # since the start
+
+
+def test_an_interval_without_ticks_has_no_latencies(meter, clock, cpu):
+    clock.now += 1000 * MS
+    cpu.now += 10 * MS
+    report = meter.report()
+    assert (report.ticks, report.rate, report.cpu_time_per_tick) == (0, 0.0, 0.0)
+    assert report.cpu_share == pytest.approx(0.01)
+    assert all(map(math.isnan, (report.latency_p50, report.latency_p99, report.latency_max)))
+
+
+def test_two_reports_at_once_are_no_error(meter):
+    meter.report()
+    assert meter.report().rate == 0.0
+
+
+def test_tick_0_counts_but_has_no_latency(meter, clock):
+    clock.now += 1000 * MS
+    meter.answered(0, clock.now - 900 * MS)
+    assert math.isnan(meter.report().latency_max)
+    answer(meter, clock, 50_000)
+    report = meter.report()
+    assert report.ticks == 2
+    assert report.latency_max == pytest.approx(50e-6)
+
+
+@pytest.mark.parametrize('offset', [-(10**12), -10 * MS, 60_000 * MS, LONG_AGO])
+def test_samples_of_another_machines_clock_are_counted_but_have_no_latency(meter, clock, offset):
+    answer(meter, clock, *[offset] * 100)
+    assert meter.age(clock.now - offset) is None
+    report = meter.report()
+    assert (report.ticks, report.rate) == (100, pytest.approx(1000.0))
+    assert all(map(math.isnan, (report.latency_p50, report.latency_p99, report.latency_max)))
+
+
+def test_old_sample_of_a_known_clock_keeps_its_age(meter, clock):
+    assert meter.age(clock.now - MS) == MS
+    assert meter.age(clock.now - 60_000 * MS) == 60_000 * MS
+
+
+def test_overruns_and_the_periods_they_skipped_are_counted(meter):
+    for periods in (1, 1, 3, 1, 51, 2, 1):
+        meter.skipped(periods)
+    assert (meter.overruns, meter.skipped_periods) == (3, 2 + 50 + 1)
+    meter.report()
+    assert (meter.overruns, meter.skipped_periods) == (3, 53)

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time steps come from the stamps of messages."""
+
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fam_bundle_node.stamps import StampClock, nanoseconds
+from fam_bundle_node.ticks import TickError
+
+FIRST_STEP = 1_000_000  # ns
+
+
+def stamp(ns):
+    return SimpleNamespace(**dict(zip(('sec', 'nanosec'), divmod(ns, 10**9), strict=True)))
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**31 * 10**9 - 1))
+def test_stamp_is_read_to_the_nanosecond(ns):
+    assert nanoseconds(stamp(ns)) == ns
+
+
+def test_time_steps_come_from_stamps():
+    clock = StampClock(FIRST_STEP)
+    stamps = [SimpleNamespace(sec=s, nanosec=n) for s, n in ((5, 999_000_000), (6, 0), (6, 500))]
+    assert [clock.since_last(stamp) for stamp in stamps] == [0.001, 0.001, 5e-7]
+
+
+def test_the_first_step_is_given_even_at_time_zero():
+    assert StampClock(FIRST_STEP).since_last(stamp(0)) == 0.001
+
+
+@settings(deadline=None)
+@given(st.integers(0, 10**15), st.lists(st.integers(1, 10**12)))
+def test_steps_add_up_without_rounding_of_the_stamps(start, steps):
+    clock, now = StampClock(FIRST_STEP), start
+    clock.since_last(stamp(now))
+    for step in steps:
+        now += step
+        assert clock.gap(stamp(now)) == clock.since_last(stamp(now)) == step / 1e9
+
+
+@pytest.mark.parametrize('back', [0, 1, FIRST_STEP, 10**9])
+def test_time_that_stands_still_or_goes_back_is_refused_and_forgotten(back):
+    clock = StampClock(FIRST_STEP)
+    clock.since_last(stamp(10**9))
+    with pytest.raises(TickError, match='does not follow'):
+        clock.since_last(stamp(10**9 - back))
+    assert clock.since_last(stamp(10**9 + FIRST_STEP)) == 0.001
+
+
+def test_there_is_no_gap_before_the_first_stamp():
+    assert StampClock(FIRST_STEP).gap(stamp(10**9)) == 0.0
+
+
+def test_looking_at_the_gap_changes_nothing():
+    clock = StampClock(FIRST_STEP)
+    clock.since_last(stamp(0))
+    assert [clock.gap(stamp(ns)) for ns in (10**9, 10**8, 10**9)] == [1.0, 0.1, 1.0]
+    assert clock.since_last(stamp(2 * FIRST_STEP)) == 0.002
+
+
+def test_after_a_restart_the_next_stamp_is_the_first():
+    clock = StampClock(FIRST_STEP)
+    clock.since_last(stamp(10**9))
+    clock.restart()
+    assert clock.gap(stamp(0)) == 0.0
+    assert clock.since_last(stamp(0)) == 0.001
+    assert clock.since_last(stamp(3 * FIRST_STEP)) == 0.003
