@@ -83,8 +83,6 @@ class TickJoin:
         self._counts = counts
         self._strict = strict
         self._open: dict[int, dict[str, Any]] = {}
-        self._opened: dict[int, int] = {}  # how many ticks were complete by then
-        self._completed = 0
         self._done: int | None = None
 
     def _is_new_run(self, topic: str, tick: int) -> bool:
@@ -106,7 +104,7 @@ class TickJoin:
         """
         tick: int = message.tick
         if self._is_new_run(topic, tick):
-            self._drop(list(self._open))
+            self._open.clear()
             self._done = None
         if self._strict and self._open and tick not in self._open:
             self._refuse(topic, tick)
@@ -115,35 +113,28 @@ class TickJoin:
             self._counts.late += tick < self._done
             return None
         held = self._open.setdefault(tick, {})
-        self._opened.setdefault(tick, self._completed)
         if topic in held:
             self._counts.duplicate += 1
             return None
         held[topic] = message
         if len(held) < len(self._topics):
             if len(self._open) > WINDOW:
-                self._drop([next(iter(self._open))])
+                del self._open[next(iter(self._open))]
                 self._counts.missing += 1
             return None
         complete = tuple(held[t] for t in self._topics)
-        passed = [other for other in self._open if other <= tick]
-        self._counts.missing += len(passed) - 1
-        self._drop(passed)
         self._done = tick
-        self._completed += 1
-        self._drop_strays()
+        self._drop_all_but_the_next(tick)
         return complete
 
-    def _drop(self, ticks: list[int]) -> None:
-        for tick in ticks:
-            del self._open[tick], self._opened[tick]
-
-    def _drop_strays(self) -> None:
-        """Drop what came far ahead of its time, lest it be taken for the real one then."""
-        oldest = self._completed - LARGEST_GAP
-        strays = [tick for tick, opened in self._opened.items() if opened < oldest]
-        self._counts.out_of_order += len(strays)
-        self._drop(strays)
+    def _drop_all_but_the_next(self, done: int) -> None:
+        """Drop what was passed by, and what came so far ahead of its time that it is a stray."""
+        passed = [tick for tick in self._open if tick <= done]
+        strays = [tick for tick in self._open if tick > done + WINDOW]
+        self._counts.missing += len(passed) - 1
+        self._counts.late += len(strays)
+        for tick in passed + strays:
+            del self._open[tick]
 
     def waits_for(self, topic: str) -> tuple[int, list[str]] | None:
         """Return the oldest open tick that ``topic`` has come for, and which topics it lacks."""
