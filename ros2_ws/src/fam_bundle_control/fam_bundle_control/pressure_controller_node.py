@@ -30,6 +30,7 @@ class PressureController(Controller):
         self.wanted, self.spool = np.zeros(units), np.zeros(units)
         self.saturated = np.zeros(units, dtype=np.bool_)
         self.command(0, 0.0, 0.0, 0.0, np.zeros(units), 1.0)  # compiles the law, changes nothing
+        self.message = ValveCommand()
         self.join = TickJoin(TOPICS, self.counts, strict=not self.realtime)
         self.publisher = self.loop_publisher(ValveCommand, 'valve_command')
         self.listen(PressureReference, 'pressure_reference')
@@ -101,16 +102,13 @@ class PressureController(Controller):
         )
         if self.trouble:
             self.spool[:] = TO_TANK
-        self.publisher.publish(
-            ValveCommand(
-                header=seen.header,
-                tick=seen.tick,
-                vent=bool(self.trouble),
-                spool=self.spool.tolist(),
-                pressure_reference=self.wanted.tolist(),
-                saturated=self.saturated.tolist(),
-            )
-        )
+        command = self.message
+        command.header, command.tick = seen.header, seen.tick
+        command.vent = bool(self.trouble)
+        command.spool = self.spool.tolist()
+        command.pressure_reference = self.wanted.tolist()
+        command.saturated = self.saturated.tolist()
+        self.publisher.publish(command)
         self.meter.answered(seen.tick, seen.steady_time)
 
 

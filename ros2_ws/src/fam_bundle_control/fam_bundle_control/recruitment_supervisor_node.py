@@ -31,6 +31,7 @@ class RecruitmentSupervisor(Controller):
         self.law = recruitment(self.configuration)
         self.units = motor_units(self.configuration)
         self.table: LagTable | None = None
+        self.message = RecruitmentState()
         self.restart()
         self.publisher = self.loop_publisher(RecruitmentState, 'recruitment_state')
         self.create_subscription(LagTableMessage, 'lag_table', self.on_lag_table, LATCHED)
@@ -89,9 +90,18 @@ class RecruitmentSupervisor(Controller):
             np.array(seen.mu_pressure),
             dt,
         )
-        self.publisher.publish(
-            RecruitmentState(header=seen.header, tick=seen.tick, **output._asdict())
-        )
+        answer = self.message  # the same one for all ticks: a new one costs as much as half a law
+        answer.header, answer.tick = seen.header, seen.tick
+        answer.recruited = output.recruited
+        answer.strain_rate = output.strain_rate
+        answer.deslack_pressure = output.deslack_pressure
+        answer.recruitment_lag = output.recruitment_lag
+        answer.source_pressure_drop = output.source_pressure_drop
+        answer.time_to_saturation = output.time_to_saturation
+        answer.time_to_desaturation = output.time_to_desaturation
+        answer.pressure_compensation = output.pressure_compensation
+        answer.lag_outside_table = output.lag_outside_table
+        self.publisher.publish(answer)
         self.meter.answered(seen.tick, seen.steady_time)
 
     def missing(self) -> str:

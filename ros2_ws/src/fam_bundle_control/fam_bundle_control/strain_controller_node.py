@@ -21,6 +21,7 @@ class StrainController(Controller):
             'strain_controller', ('fam', 'strain_loop', 'source', 'reference', 'simulation')
         )
         self.law = strain_loop(self.configuration)
+        self.message = PressureReference()
         self.restart()
         self.publisher = self.loop_publisher(PressureReference, 'pressure_reference')
         strain_loop_step(self.law, self.state_of_law, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -44,16 +45,11 @@ class StrainController(Controller):
             seen.mu_pressure[0],
             dt,
         )
-        self.publisher.publish(
-            PressureReference(
-                header=seen.header,
-                tick=seen.tick,
-                strain_reference=reference,
-                strain_error=output.error,
-                pressure=output.pressure,
-                pressure_unlimited=output.unlimited,
-            )
-        )
+        answer = self.message
+        answer.header, answer.tick = seen.header, seen.tick
+        answer.strain_reference, answer.strain_error = reference, output.error
+        answer.pressure, answer.pressure_unlimited = output.pressure, output.unlimited
+        self.publisher.publish(answer)
         self.meter.answered(seen.tick, seen.steady_time)
 
 

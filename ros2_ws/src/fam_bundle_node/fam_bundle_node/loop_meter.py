@@ -10,6 +10,7 @@ import numpy as np
 from fam_bundle_node.ticks import TickCounts
 
 NANOSECONDS = 1e-9
+HISTOGRAM = 100_000  # us
 # A first sample of another age was stamped by another machine's clock.
 OLDEST_FIRST_SAMPLE = 5_000_000_000  # ns
 
@@ -27,6 +28,26 @@ class LoopReport(NamedTuple):
     cpu_share: float
 
 
+class WholeRun(NamedTuple):
+    """All latencies of a node since its start (s), and how many answers came within a period."""
+
+    answered: int
+    in_time: int
+    skipped_periods: int
+    latency_p50: float
+    latency_p99: float
+    latency_max: float
+
+    def words(self) -> str:
+        """Return the same in words, for a log."""
+        p50, p99, largest = (round(1e6 * latency) for latency in self[3:])
+        return (
+            f'{self.answered} answered, {self.in_time} within a period, '
+            f'{self.skipped_periods} periods skipped; '
+            f'latency p50 {p50} us, p99 {p99} us, max {largest} us'
+        )
+
+
 class LoopMeter:
     """Takes the time of each answer; ``report`` sums up since the report before."""
 
@@ -42,6 +63,9 @@ class LoopMeter:
         self._latencies: list[int] = []
         self._begin, self._cpu_begin, self._ticks_begin = clock(), cpu(), 0
         self._comparable: bool | None = None
+        # One count for each microsecond, the last one for all above: a run may last for days.
+        self._histogram = np.zeros(HISTOGRAM, dtype=np.int64)
+        self._longest = 0.0
 
     def age(self, steady_time: int) -> int | None:
         """Return how long ago ``steady_time`` was (ns), or None if it is another machine's."""
@@ -74,6 +98,7 @@ class LoopMeter:
         done = ticks - self._ticks_begin
         spent = (cpu - self._cpu_begin) * NANOSECONDS
         self._begin, self._cpu_begin, self._ticks_begin = now, cpu, ticks
+        self._keep(latencies)
         found = np.array(latencies or [np.nan]) * NANOSECONDS
         p50, p99, largest = np.percentile(found, (50.0, 99.0, 100.0)).tolist()
         return LoopReport(
@@ -85,4 +110,21 @@ class LoopMeter:
             largest,
             spent / done if done else 0.0,
             spent / interval,
+        )
+
+    def _keep(self, latencies: list[int]) -> None:
+        if latencies:
+            microseconds = np.minimum(np.array(latencies) // 1000, HISTOGRAM - 1)
+            self._histogram += np.bincount(microseconds, minlength=HISTOGRAM)
+            self._longest = max(self._longest, max(latencies) * NANOSECONDS)
+
+    def whole_run(self, period: int) -> WholeRun:
+        """Return the sums over all reports, latencies to 1 us; ``period`` in ns."""
+        reached = np.cumsum(self._histogram)
+        ranks = (0.5 * reached[-1], 0.99 * reached[-1])
+        p50, p99 = (float(np.searchsorted(reached, rank)) * 1e-6 for rank in ranks)
+        within = min(period // 1000, HISTOGRAM) - 1
+        in_time = int(reached[within])
+        return WholeRun(
+            self.ticks, in_time, self.skipped_periods, p50, min(p99, self._longest), self._longest
         )

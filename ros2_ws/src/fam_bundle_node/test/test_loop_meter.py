@@ -140,3 +140,21 @@ def test_overruns_and_the_periods_they_skipped_are_counted(meter):
     assert (meter.overruns, meter.skipped_periods) == (3, 2 + 50 + 1)
     meter.report()
     assert (meter.overruns, meter.skipped_periods) == (3, 53)
+
+
+def test_a_whole_run_is_summed_over_its_reports():
+    now = [0]
+    meter = LoopMeter(clock=lambda: now[0], cpu=lambda: 0)
+    generator = np.random.default_rng(1)
+    latencies = generator.integers(100_000, 3_000_000, 5000)
+    for tick, latency in enumerate(latencies, 1):
+        now[0] += 1_000_000
+        meter.answered(tick, now[0] - int(latency))
+        if tick % 1000 == 0:
+            meter.report()
+    whole = meter.whole_run(1_000_000)
+    assert whole.answered == 5000
+    assert whole.in_time == np.count_nonzero(latencies < 1_000_000)
+    assert whole.latency_p50 == pytest.approx(np.median(latencies) * 1e-9, abs=2e-6)
+    assert whole.latency_p99 == pytest.approx(np.percentile(latencies, 99) * 1e-9, abs=2e-6)
+    assert whole.latency_max == pytest.approx(latencies.max() * 1e-9)

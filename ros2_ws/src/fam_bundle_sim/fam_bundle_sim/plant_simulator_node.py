@@ -117,6 +117,7 @@ class PlantSimulator(LoopNode):
         """Hold the command; go on where the pacing waits for it."""
         if not self.is_answer(command):
             return
+        self.meter.answered(command.tick, self.sampled_at[command.tick % SAMPLES])
         first = self.answered < 0
         with self.lock:
             self.answered = command.tick
@@ -124,7 +125,6 @@ class PlantSimulator(LoopNode):
             self.spool = np.clip(command.spool, -1.0, 1.0)
             if command.vent:
                 self.watch.latch('pressure_controller asks for the safe state')
-        self.meter.answered(command.tick, self.sampled_at[command.tick % SAMPLES])
         if first:
             self.started_at = time.monotonic_ns()
             self.pacing.start(self.step, self.on_failed_step)
@@ -197,8 +197,9 @@ class PlantSimulator(LoopNode):
     def finish(self) -> None:
         """Say how fast the run was, and end the node."""
         elapsed = (time.monotonic_ns() - self.started_at) * 1e-9
-        self.get_logger().info(f'ran {self.tick + 1} ticks in {elapsed:.4f} s')
         self.report()
+        samples, whole = self.tick + 1, self.meter.whole_run(self.period_ns)
+        self.get_logger().info(f'ran {samples} ticks in {elapsed:.4f} s; {whole.words()}')
         self.publisher.wait_for_all_acked(LAST_MESSAGES)  # a recorder may be behind
         self.succeed()
 
