@@ -41,8 +41,27 @@ def parser() -> Parser:
     _add_common(demo, Path('runs/demo'))
     bench = commands.add_parser('bench', help='how fast the loop runs on this machine')
     _add_common(bench, Path('runs/bench'))
+    bench.add_argument(
+        '--rounds',
+        type=_rounds,
+        default=3,
+        metavar='N',
+        help='how often each candidate runs, some seven minutes a round (%(default)s)',
+    )
+    faults = commands.add_parser(
+        'faults', help='what goes wrong in real time, done on purpose: one verdict each'
+    )
+    _add_common(faults, Path('runs/faults'))
+    faults.add_argument('--only', default='', metavar='TEXT', help='faults that contain TEXT')
     _add_top(commands)
     return top
+
+
+def _rounds(text: str) -> int:
+    number = int(text) if text.isdecimal() else 0
+    if not 1 <= number <= 100:
+        raise argparse.ArgumentTypeError(f'{text!r}: must be an integer from 1 to 100')
+    return number
 
 
 def _add_common(command: argparse.ArgumentParser, out: Path) -> None:
@@ -156,6 +175,12 @@ def run_experiment_command(options: argparse.Namespace, configuration: Configura
     print(f'  maximum error {metrics["max_error"]:.4f}')
     print(f'  upshifts      {_times(metrics["upshift_times"])}')
     print(f'  downshifts    {_times(metrics["downshift_times"])}')
+    if options.pace == 'realtime':
+        loop = metrics['loop']
+        print(f'  in real time  {loop["answered"]} samples answered, {loop["late"]} of them late;')
+        print(f'                {loop["skipped_periods"]} periods skipped, {loop["missing"]} lost')
+        for state in loop['states']:
+            print(f'                {state}')
     print(f'written to {options.out}')
 
 
@@ -165,6 +190,25 @@ def _times(times: Sequence[float]) -> str:
 
 def _terminate(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
+
+
+def run_command(options: argparse.Namespace, configuration: Configuration) -> int:
+    """Run a command that takes a configuration and return its exit status."""
+    if options.command == 'experiment':
+        run_experiment_command(options, configuration)
+    elif options.command == 'demo':
+        from fam_bundle_bringup.demo import run_demo
+
+        run_demo(configuration, options.out)
+    elif options.command == 'bench':
+        from fam_bundle_bringup.bench import run_bench
+
+        run_bench(configuration, options.out, options.rounds)
+    else:
+        from fam_bundle_bringup.faults import run_faults
+
+        return 0 if run_faults(configuration, options.out, options.only) else 1
+    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -180,21 +224,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         results = RESULTS if options.command == 'experiment' else ()
         changes = changes_of(options) if options.command == 'experiment' else {}
+        if options.command == 'experiment' and options.composed and options.pace == 'offline':
+            raise ConfigurationError('--composed: --pace offline has no nodes to compose')
         config = options.config or default_configuration()
         configuration = checked_configuration(config, changes)
         if config.resolve() == (options.out / 'parameters.yaml').resolve():
             raise ConfigurationError(f'--out {options.out}: would overwrite {config}')
         prepare_folder(options.out, results)
-        if options.command == 'experiment':
-            run_experiment_command(options, configuration)
-        elif options.command == 'demo':
-            from fam_bundle_bringup.demo import run_demo
-
-            run_demo(configuration, options.out)
-        else:
-            from fam_bundle_bringup.bench import run_bench
-
-            run_bench(configuration, options.out)
+        return run_command(options, configuration)
     except ConfigurationError as error:
         print(f'fam {options.command}: {error}', file=sys.stderr)
         return 2
@@ -204,7 +241,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (RuntimeError, OSError) as error:
         print(f'fam {options.command}: {error}', file=sys.stderr)
         return 1
-    return 0
 
 
 if __name__ == '__main__':

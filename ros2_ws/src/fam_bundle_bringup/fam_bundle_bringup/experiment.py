@@ -3,6 +3,7 @@
 
 import dataclasses
 import importlib.metadata
+import json
 import os
 import platform
 from collections.abc import Callable, Iterable, Mapping
@@ -102,6 +103,18 @@ def metrics_of(configuration: Configuration, pace: str, trace: Trace) -> dict[st
     }
 
 
+def loop_of(reports: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return what the plant's loop statistics come to: counts, and every state but 'running'."""
+    plant = [report for report in reports if report['node'].endswith('/plant_simulator')]
+    last = plant[-1] if plant else {}
+    counts = ('missing', 'late', 'duplicate', 'out_of_order', 'refused')
+    return {
+        'answered': last.get('ticks', 0),
+        **{name: last.get(name, 0) for name in ('skipped_periods', 'overruns', *counts)},
+        'states': list(dict.fromkeys(r['state'] for r in plant if r['state'] != 'running')),
+    }
+
+
 def prepare_folder(folder: Path, results: Iterable[str]) -> None:
     """Make ``folder`` and take away ``results`` of an earlier call in it.
 
@@ -144,5 +157,7 @@ def run_experiment(
         raise
     save_trace(trace, folder / 'trace.npz')
     metrics = metrics_of(configuration, pace, trace)
+    if pace == 'realtime':
+        metrics['loop'] = loop_of(json.loads((folder / 'loop_statistics.json').read_text()))
     write_json(metrics, folder / 'metrics.json')
     return Result(trace, metrics)

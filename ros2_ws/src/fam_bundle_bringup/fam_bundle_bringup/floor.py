@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 from fam_bundle_bringup.graph import LOOP_LISTENERS, own_domain
 from fam_bundle_bringup.processes import NodeGroup
 from fam_bundle_model.parameters import ProcessParameters
+from fam_bundle_node.pacing import Periodic
 from fam_bundle_node.tuning import tune
 
 MODULE = 'fam_bundle_bringup.floor'
@@ -45,12 +46,16 @@ POLL = 0.05  # s between two looks at the processes
 
 
 class Measured(NamedTuple):
-    """Rate in ticks/s; times in s from just before a publication to the callback of its answer."""
+    """Rate in ticks/s; times in s from just before a publication to the callback of its answer.
+
+    On a clock from when it was due, and the share of periods with an answer in time.
+    """
 
     ticks_per_second: float
     p50: float
     p99: float
     maximum: float
+    in_time_share: float = 1.0
 
 
 def relay_loop(ticks: int, units: int) -> Measured:
@@ -60,6 +65,18 @@ def relay_loop(ticks: int, units: int) -> Measured:
     """
     with own_domain():
         return measure_ticks(MODULE, LOOP_ROLES, ticks, units, os.environ)
+
+
+def relay_on_a_clock(seconds: float, units: int, period: float, priority: int) -> Measured:
+    """Run the four relays on a clock of ``period`` (s), with the ``priority`` of SCHED_FIFO.
+
+    Raises RuntimeError, with the last line of a log, when one fails or the time runs out.
+    """
+    timed = (str(round(period * 1e9)), str(priority))
+    with own_domain():
+        return measure_ticks(
+            MODULE, LOOP_ROLES, round(seconds / period), units, os.environ, *timed
+        )
 
 
 def relay_ping(ticks: int, units: int) -> Measured:
@@ -88,7 +105,7 @@ def measure_ticks(
     arguments = (str(ticks), str(units), *more)
     found = run_roles(module, roles, arguments, environment, timeout)
     latency = (found['latency_us'][name] * 1e-6 for name in ('p50', 'p99', 'max'))
-    return Measured(found['ticks_per_second'], *latency)
+    return Measured(found['ticks_per_second'], *latency, found.get('in_time_share', 1.0))
 
 
 def run_roles(
@@ -131,37 +148,44 @@ def rank(ordered: Sequence[float], share: float) -> float:
 
 
 class RoundTrips:
-    """Counts ticks and notes when each was sent and when its answer came."""
+    """Counts ticks and notes when each was sent, or due, and when its answer came (ns)."""
 
-    def __init__(self, ticks: int) -> None:
-        """Expect ``ticks`` ticks, at least 1, after those that warm up."""
-        self.tick = 0
-        self._ticks = ticks
+    def __init__(self, ticks: int, period: int = 0) -> None:
+        """Expect ``ticks`` ticks, at least 1, after those that warm up; ``period`` in ns."""
+        self.last = WARM_UP + ticks - 1
+        self._period = period
         self._sent: list[int] = []
-        self._answered: list[int] = []
+        self._answered: dict[int, int] = {}
 
-    def send(self) -> None:
-        """Note that the tick is sent now."""
-        self._sent.append(time.monotonic_ns())
+    def send(self, due: int | None = None) -> int:
+        """Note that a tick is sent now, or was due; return its number."""
+        self._sent.append(time.monotonic_ns() if due is None else due)
+        return len(self._sent) - 1
 
-    def answer(self) -> bool:
-        """Note that the answer has come, count the tick, and return whether another follows."""
-        self._answered.append(time.monotonic_ns())
-        self.tick += 1
-        return self.tick < WARM_UP + self._ticks
+    def answer(self, tick: int) -> None:
+        """Note that the answer to ``tick`` has come."""
+        self._answered[tick] = time.monotonic_ns()
 
     def report(self) -> str:
-        """Return ticks/s and latencies in us as a line of JSON."""
-        sent, answered = self._sent[WARM_UP:], self._answered[WARM_UP:]
-        taken = sorted((end - begin) / 1e3 for begin, end in zip(sent, answered, strict=True))
+        """Return ticks/s, latencies in us and the share in time as a line of JSON."""
+        counted = [tick for tick in sorted(self._answered) if tick >= WARM_UP]
+        taken = sorted((self._answered[tick] - self._sent[tick]) / 1e3 for tick in counted)
         latency = {'p50': rank(taken, 0.5), 'p99': rank(taken, 0.99), 'max': taken[-1]}
-        rate = self._ticks / (answered[-1] - sent[0]) * 1e9
-        return json.dumps({'ticks_per_second': rate, 'latency_us': latency})
+        elapsed = self._answered[counted[-1]] - self._sent[WARM_UP]
+        in_time = sum(latency * 1e3 < self._period for latency in taken)
+        periods = max((self._sent[-1] - self._sent[WARM_UP]) // max(self._period, 1) + 1, 1)
+        return json.dumps(
+            {
+                'ticks_per_second': len(counted) / elapsed * 1e9,
+                'latency_us': latency,
+                'in_time_share': in_time / periods if self._period else 1.0,
+            }
+        )
 
 
-def tune_process(pace: str) -> None:
+def tune_process(pace: str, priority: int = 0) -> None:
     """Give this process the settings that the loop's nodes have by default under ``pace``."""
-    for warning in tune(ProcessParameters(), pace):
+    for warning in tune(ProcessParameters(priority=priority), pace):
         print(warning, file=sys.stderr)
 
 
@@ -181,39 +205,52 @@ def loop_message(topic: str, units: int) -> Any:
 class BareNode:
     """A node of rclpy with the loop's topics; nothing checks, nothing computes."""
 
-    def __init__(self, role: str, ticks: int, units: int) -> None:
-        """Take part in the loop as ``role``; raises KeyError when there is no such role."""
+    def __init__(self, role: str, ticks: int, units: int, period: int = 0) -> None:
+        """Take part in the loop as ``role``, on a clock if ``period`` (ns) is not 0.
+
+        Raises KeyError when there is no such role.
+        """
         import rclpy
         from rclpy.task import Future
 
         self.done = Future()
-        self.trips = RoundTrips(ticks)
+        self.trips = RoundTrips(ticks, period)
+        self._period = period
         self._node = rclpy.create_node(role)
         self._units = units
         ROLES[role](self)
 
     def plant(self, listeners: int) -> None:
-        """Publish a state once ``listeners`` listen, and the next on each answer."""
+        """Publish a state once ``listeners`` listen, and the next on each answer or by a clock."""
         state, trips = loop_message('bundle_state', self._units), self.trips
         publisher = self._publisher('bundle_state')
+        pacing = Periodic(self._period) if self._period else None
 
-        def publish() -> None:
-            state.tick = trips.tick
-            trips.send()
+        def publish(due: int | None = None) -> None:
+            state.tick = trips.send(due)
             publisher.publish(state)
 
-        def advance(_: Any) -> None:
-            if trips.answer():
-                publish()
-            else:
+        def step(_: int) -> None:
+            if state.tick < trips.last:
+                publish(pacing.due)
+
+        def answered(command: Any) -> None:
+            trips.answer(command.tick)
+            if command.tick >= trips.last:
+                if pacing:
+                    pacing.stop()
                 self.done.set_result(None)
+            elif pacing is None or command.tick < WARM_UP:
+                publish()
+            elif command.tick == WARM_UP:
+                pacing.start(step, self.done.set_exception)
 
         def start() -> None:
             if publisher.get_subscription_count() >= listeners:
                 timer.cancel()
                 publish()
 
-        self._listen('valve_command', advance)
+        self._listen('valve_command', answered)
         timer = self._node.create_timer(MATCHING_PERIOD, start)
 
     def relay(self, topic: str) -> None:
@@ -222,14 +259,13 @@ class BareNode:
 
     def join(self) -> None:
         """Answer with a valve command once all three messages of a tick have come."""
-        answer, arrived = self._answer('valve_command'), 0
+        answer, arrived = self._answer('valve_command'), dict[int, int]()
 
         def collect(message: Any) -> None:
-            nonlocal arrived
-            arrived += 1
-            # Lock-step: no message of the next tick is sent before this one's answer.
-            if arrived == len(JOINED):
-                arrived = 0
+            tick = message.tick
+            arrived[tick] = arrived.get(tick, 0) + 1
+            if arrived[tick] == len(JOINED):
+                del arrived[tick]
                 answer(message)
 
         for topic in JOINED:
@@ -242,10 +278,11 @@ class BareNode:
         return self._node.create_publisher(message_type, topic, LOOP_PUBLISHER)
 
     def _listen(self, topic: str, callback: Callable[[Any], None]) -> None:
-        from fam_bundle_node.qos import LOOP_SUBSCRIPTION
+        from fam_bundle_node.qos import LOOP_SUBSCRIPTION, REALTIME_SUBSCRIPTION
 
         message_type = type(loop_message(topic, self._units))
-        self._node.create_subscription(message_type, topic, callback, LOOP_SUBSCRIPTION)
+        quality = REALTIME_SUBSCRIPTION if self._period else LOOP_SUBSCRIPTION
+        self._node.create_subscription(message_type, topic, callback, quality)
 
     def _answer(self, topic: str) -> Callable[[Any], None]:
         answer, publisher = loop_message(topic, self._units), self._publisher(topic)
@@ -284,10 +321,11 @@ def main() -> None:
     import rclpy
     from rclpy.executors import ExternalShutdownException
 
-    role, ticks, units = sys.argv[1:]
+    role, (ticks, units, *timed) = sys.argv[1], map(int, sys.argv[2:])
+    period, priority = timed or (0, 0)
     rclpy.init(args=[])
-    node = BareNode(role, int(ticks), int(units))
-    tune_process('lockstep')
+    node = BareNode(role, ticks, units, period)
+    tune_process('realtime' if period else 'lockstep', priority)
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         node.spin()
     if node.done.done():

@@ -82,12 +82,12 @@ def cyclone_loop(ticks: int, units: int) -> Measured:
 
 def count(trips: RoundTrips, send: Callable[[], None], receive: Callable[[], None]) -> None:
     """Send tick after tick, each when the answer of the one before has come."""
-    running = True
-    while running:
-        trips.send()
+    tick = -1
+    while tick < trips.last:
+        tick = trips.send()
         send()
         receive()
-        running = trips.answer()
+        trips.answer(tick)
 
 
 def relay(send: Callable[[], None], receive: Callable[[], None]) -> None:

@@ -3,7 +3,7 @@
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,14 +49,26 @@ def own_domain() -> Iterator[int]:
 
 
 def start_nodes(
-    group: NodeGroup, parameter_file: Path, listeners: int, *, composed: bool = False
-) -> None:
-    """Start the nodes with one parameter file, each as a process or all in one."""
+    group: NodeGroup,
+    parameter_file: Path,
+    listeners: int,
+    *,
+    composed: bool = False,
+    bundle: str = '',
+) -> str:
+    """Start the nodes with one parameter file, each as a process or all in one.
+
+    ``bundle`` names the namespace of one of several. Returns the name of the process that ends
+    with the run.
+    """
     for package, name in (COMPOSED,) if composed else NODES:
         command = [executable(package, name), '--ros-args', '--params-file', str(parameter_file)]
         if name in OWNERS:
             command += ['-p', f'run.listeners:={listeners}']
-        group.start(name, command)
+        if bundle:
+            command += ['-r', f'__ns:=/{bundle}']
+        group.start(f'{bundle}{name}', command)
+    return f'{bundle}{COMPOSED[1] if composed else "plant_simulator"}'
 
 
 def run_graph(
@@ -74,11 +86,10 @@ def run_graph(
     """
     parameter_file = folder / 'parameters.yaml'
     write_yaml(configuration, parameter_file)
-    owner = COMPOSED[1] if composed else 'plant_simulator'
     failure = None
-    with own_domain(), recording() as (recorder, listen):
+    with own_domain(), recording() as ((recorder,), listen):
         with nodes_in(folder) as group:
-            start_nodes(group, parameter_file, LOOP_LISTENERS + 1, composed=composed)
+            owner = start_nodes(group, parameter_file, LOOP_LISTENERS + 1, composed=composed)
             try:
                 while not group.finished(owner):
                     listen(SLICE)
@@ -114,8 +125,13 @@ def nodes_in(folder: Path) -> NodeGroup:
 
 
 @contextlib.contextmanager
-def recording() -> Iterator[tuple['TraceRecorder', Callable[[float], None]]]:
-    """Give a trace recorder in this process, and a function that listens for some seconds."""
+def recording(
+    bundles: Sequence[str] = ('',),
+) -> Iterator[tuple[list['TraceRecorder'], Callable[[float], None]]]:
+    """Give a trace recorder for each of ``bundles``, and a function that listens for some seconds.
+
+    A bundle is named by its namespace; all recorders are in this process.
+    """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
     from rclpy.task import Future
@@ -126,10 +142,12 @@ def recording() -> Iterator[tuple['TraceRecorder', Callable[[float], None]]]:
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     with contextlib.ExitStack() as stack:
         stack.callback(rclpy.try_shutdown)
-        recorder, never = TraceRecorder(), Future()
-        # Else its subscriptions live on and hold the next run up.
-        stack.callback(recorder.destroy_node)
+        never, recorders = Future(), [TraceRecorder(bundle) for bundle in bundles]
+        for recorder in recorders:
+            # Else its subscriptions live on and hold the next run up.
+            stack.callback(recorder.destroy_node)
         executor = make_executor()
         stack.callback(executor.shutdown)
-        executor.add_node(recorder)
-        yield recorder, lambda wait: executor.spin_until_future_complete(never, timeout_sec=wait)
+        for recorder in recorders:
+            executor.add_node(recorder)
+        yield recorders, lambda wait: executor.spin_until_future_complete(never, timeout_sec=wait)

@@ -24,16 +24,19 @@ class Jitter(NamedTuple):
     skipped: int  # not in time either
 
 
-def wake_up_jitter(seconds: float, period: float, busy_tail: float = 0.0) -> Jitter:
+def wake_up_jitter(
+    seconds: float, period: float, busy_tail: float = 0.0, priority: int = 0
+) -> Jitter:
     """Return how late a new process wakes that sleeps every ``period`` s, for ``seconds`` s.
 
     It spends the last ``busy_tail`` s of each wait awake, and has the process settings of the
-    loop's nodes in real time. A wake-up later than the next period's time skips to the next one
-    in the future.
+    loop's nodes in real time, with ``priority`` as theirs. A wake-up later than the next
+    period's time skips to the next one in the future.
 
     Raises RuntimeError, with the last line of its log, when it fails or hangs.
     """
     arguments = [str(round(value * 1e9)) for value in (seconds, period, busy_tail)]
+    arguments.append(str(priority))
     found = run_roles(MODULE, (ROLE,), arguments, os.environ, START_TIMEOUT + 2.0 * seconds)
     return Jitter(**found)
 
@@ -69,8 +72,8 @@ def summary(lateness: list[int], skipped: int, period: int) -> Jitter:
 
 def main() -> None:
     """Sleep, and print how late the wake-ups were."""
-    duration, period, busy_tail = (int(argument) for argument in sys.argv[2:])
-    tune_process('realtime')
+    duration, period, busy_tail, priority = (int(argument) for argument in sys.argv[2:])
+    tune_process('realtime', priority)
     lateness, skipped = wake_ups(max(duration // period, 1), period, busy_tail)
     print(json.dumps(summary(lateness, skipped, period)._asdict()), flush=True)
 

@@ -69,17 +69,17 @@ class NodeGroup:
         self._nodes.append(NodeProcess(name, process, log))
         return process
 
-    def finished(self, name: str) -> bool:
-        """Return whether the node ``name`` has ended well.
+    def finished(self, *names: str) -> bool:
+        """Return whether all the nodes ``names`` have ended well.
 
         Raises NodeDied when any node has ended otherwise.
         """
         done = {node.name for node in self._nodes if node.process.poll() == 0}
         for node in self._nodes:
             status = node.process.poll()
-            if status is not None and not (status == 0 and node.name == name):
+            if status is not None and not (status == 0 and node.name in names):
                 raise NodeDied(f'{node.name} {_ending(status)}{_last_words(node.log)}')
-        return name in done
+        return done.issuperset(names)
 
     def __enter__(self) -> 'NodeGroup':
         """Return the group."""

@@ -16,7 +16,10 @@ class Tracking(NamedTuple):
 
 
 def tracking(trace: Trace, start: float, stop: float) -> Tracking:
-    """Return the metrics over ``start <= time < stop`` (s); each tick stands for one period.
+    """Return the metrics over ``start <= time < stop`` (s).
+
+    Each tick stands for the time until the next one, the last for as long as the first: in real
+    time periods can be skipped.
 
     Raises ValueError when the trace has fewer than two ticks in that window.
     """
@@ -25,7 +28,9 @@ def tracking(trace: Trace, start: float, stop: float) -> Tracking:
     if np.count_nonzero(window) < 2:
         raise ValueError(f'the trace has no ticks from {start:g} s to {stop:g} s')
     error = np.abs(trace['strain_reference'] - trace['strain'])[window]
-    return Tracking(float(error.sum() * (time[1] - time[0])), float(error.max()))
+    step = np.diff(time[window], append=np.nan)
+    step[-1] = step[0]
+    return Tracking(float((error * step).sum()), float(error.max()))
 
 
 def shift_times(trace: Trace) -> tuple[list[float], list[float]]:

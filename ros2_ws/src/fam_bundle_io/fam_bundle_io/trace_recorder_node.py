@@ -32,9 +32,9 @@ TOPICS = {
 class TraceRecorder(Node):
     """Takes the messages as bytes, for the loop runs while it listens; decodes them later."""
 
-    def __init__(self) -> None:
+    def __init__(self, namespace: str = '') -> None:
         """Listen to the answers; to the plant, which starts the run, when these are matched."""
-        super().__init__('trace_recorder')
+        super().__init__('trace_recorder', namespace=namespace)
         self.raw: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
         self.statistics: list[LoopStatistics] = []
         self.create_subscription(

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The figure of a benchmark: rates, latencies on a clock, and what more units and bundles cost."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from matplotlib.figure import Figure
+
+from fam_bundle_io.figures_style import styled
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Medians = Mapping[str, float]
+Spread = Mapping[str, Sequence[float]]
+
+RATES = {
+    'composed_default_executor': 'one process, default executor',
+    'lockstep_default_executor': 'graph, default executor',
+    'lockstep_recorded': 'graph, recorded',
+    'lockstep': 'graph',
+    'cyclone': 'relays, Cyclone DDS in Python',
+    'floor': 'relays, no computation',
+    'composed_recorded': 'one process, recorded',
+    'composed': 'one process',
+    'ping': 'two-process ping',
+    'unix_socket': 'relays, Unix sockets',
+}
+ON_A_CLOCK = {
+    'machine': 'machine alone',
+    'realtime_floor': 'relays, no computation',
+    'realtime_composed': 'one process',
+    'realtime': 'five processes',
+    'realtime_recorded': 'five, recorded',
+    'realtime_default_executor': 'default executor',
+}
+
+
+@styled
+def bench_figure(medians: Medians, spread: Spread) -> Figure:
+    """Return the figure of ``medians`` with their ``spread``, by the names of ``bench.json``."""
+    figure = Figure(figsize=(9.0, 6.6), layout='constrained')
+    ((rates, latencies), (units, bundles)) = figure.subplots(2, 2)
+    draw_rates(rates, medians, spread)
+    draw_latencies(latencies, medians)
+    draw_units(units, medians, spread)
+    draw_bundles(bundles, medians, spread)
+    return figure
+
+
+def draw_rates(axes: 'Axes', medians: Medians, spread: Spread) -> None:
+    """Draw ticks per second in lock-step."""
+    shown = {f'{name}_ticks_per_second': label for name, label in RATES.items()}
+    names = [name for name in shown if name in medians]
+    values = [medians[name] for name in names]
+    labels = [shown[name] for name in names]
+    axes.barh(labels, values, xerr=errors(names, medians, spread), height=0.6)
+    axes.set_xscale('log')
+    axes.set_xlabel('ticks per second in lock-step')
+
+
+def draw_latencies(axes: 'Axes', medians: Medians) -> None:
+    """Draw the latencies on a clock."""
+    rows = range(len(ON_A_CLOCK))
+    for part, label, marker in (('p50', 'median', 'o'), ('p99', '99 %', 's'), ('max', 'max', 'x')):
+        found = [medians[f'{name}_latency_{part}_us'] for name in ON_A_CLOCK]
+        axes.plot(found, rows, marker, label=label)
+    axes.axvline(1000.0, linestyle='--', color='0.4', linewidth=1.0)
+    axes.set_yticks(list(rows), list(ON_A_CLOCK.values()))
+    axes.invert_yaxis()
+    axes.set_xscale('log')
+    axes.set_xlabel('sample to valve command at 1 kHz (µs)')
+    axes.legend(loc='upper left')
+
+
+def draw_units(axes: 'Axes', medians: Medians, spread: Spread) -> None:
+    """Draw the time per tick over the number of motor units."""
+    for kind, label in (('lockstep', 'five processes'), ('composed', 'one process')):
+        names = [name for name in medians if name.startswith(f'{kind}_') and 'units_tick' in name]
+        numbers = [int(name.split('_')[1]) for name in names]
+        values = [medians[name] for name in names]
+        axes.errorbar(
+            numbers, values, errors(names, medians, spread), marker='o', capsize=3, label=label
+        )
+    axes.set_xlabel('motor units')
+    axes.set_ylabel('time per tick (µs)')
+    axes.set_ylim(bottom=0.0)
+    axes.legend()
+
+
+def draw_bundles(axes: 'Axes', medians: Medians, spread: Spread) -> None:
+    """Draw the ticks per second of several bundles together."""
+    for kind, label in (('lockstep', 'five processes each'), ('composed', 'one process each')):
+        names = [name for name in medians if name.startswith(f'{kind}_') and '_bundles_' in name]
+        numbers = [int(name.split('_')[1]) for name in names]
+        values = [medians[name] for name in names]
+        axes.errorbar(
+            numbers, values, errors(names, medians, spread), marker='o', capsize=3, label=label
+        )
+    axes.set_xlabel('bundles side by side')
+    axes.set_ylabel('ticks per second, all together')
+    axes.set_ylim(bottom=0.0)
+    axes.legend()
+
+
+def errors(names: Sequence[str], medians: Medians, spread: Spread) -> list[list[float]]:
+    """Return how far the spread reaches below and above the medians."""
+    return [
+        [medians[name] - spread[name][0] for name in names],
+        [spread[name][1] - medians[name] for name in names],
+    ]
