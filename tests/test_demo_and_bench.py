@@ -26,6 +26,21 @@ FIGURES = {
     'lag_table',
 }
 
+PROMISED = (
+    'offline_real_time_factor',
+    'lockstep_ticks_per_second',
+    'lag_table_seconds',
+    'first_tick_seconds',
+    'lockstep_vs_default_executor',
+    'lockstep_latency_vs_floor',
+    'composed_ticks_per_second',
+    'realtime_arrived_share',
+    'realtime_in_time_share',
+    'machine_in_time_share',
+    'recording_cost_share',
+    'cost_per_motor_unit_us',
+)
+
 
 def test_demo_writes_all_its_results(
     quick: Callable[..., Configuration],
@@ -53,15 +68,33 @@ def test_demo_writes_all_its_results(
         assert f'{demo.PAPER[scheme].iae:.4f}' in printed
 
 
-def test_bench_writes_every_figure(
+def test_bench_measures_every_candidate(
     quick: Callable[..., Configuration], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bench, 'REPEATS', 1)
-    bench.run_bench(quick(), tmp_path)
+    for name, value in {
+        'TICKS': 200,
+        'TURNS': 1,
+        'SLOW_TICKS': 50,
+        'SOCKET_TICKS': 1000,
+        'BUNDLE_TICKS': 200,
+        'COMPOSED_BUNDLE_TICKS': 200,
+        'REAL_TIME': 1.0,
+        'SHORT_REAL_TIME': 0.5,
+        'UNITS': (2, 3),
+        'BUNDLES': (1, 2),
+    }.items():
+        monkeypatch.setattr(bench, name, value)
+    bench.run_bench(quick(), tmp_path, 1)
     content = json.loads((tmp_path / 'bench.json').read_text())
-    for name in bench.MEASUREMENTS:
-        assert content[name] == content['values'][name][0] > 0.0
-        assert content['spread'][name] == [content[name], content[name]]
+    assert set(PROMISED) <= set(content['values'])
+    for name, values in content['values'].items():
+        assert content[name] == values[0]
+        assert content['spread'][name] == [values[0], values[0]]
+        if name.endswith(('_per_second', '_us')) and 'cost' not in name:
+            assert values[0] > 0.0, name
+        if name.endswith(('in_time_share', 'arrived_share')):
+            assert 0.0 <= values[0] <= 1.0, name
+    assert (tmp_path / 'bench.png').read_bytes().startswith(b'\x89PNG')
 
 
 @pytest.fixture(scope='module')

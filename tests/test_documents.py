@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from ament_index_python.packages import get_package_prefix
 
 from fam_bundle_bringup.cli import parser
 from fam_bundle_io.trace import PER_UNIT, SCALARS
 from fam_bundle_model.lag_table import PHYSICS
 from fam_bundle_model.parameters import GROUPS
 from fam_bundle_model.schema import Declaration, declarations, required
+from fam_bundle_node.loop_node import COMMON
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / 'ros2_ws' / 'src'
@@ -130,7 +132,7 @@ class NodeFile:
         if named and len(start.args) > 1:
             groups = self.constants.get('GROUPS')
             known = {'PHYSICS': PHYSICS, 'GROUPS': groups and ast.literal_eval(groups)}
-            self.groups = set(eval(ast.unparse(start.args[1]), known))
+            self.groups = set(eval(ast.unparse(start.args[1]), known)) | set(COMMON)
 
     def connections(self) -> Iterator[Connection]:
         for call in self.calls:
@@ -270,12 +272,13 @@ def test_message_package_names_its_files() -> None:
 
 
 def test_message_package_names_the_topics_that_are_published() -> None:
+    reports = SOURCE / 'fam_bundle_node' / 'fam_bundle_node' / 'statistics_publisher.py'
+    nodes = [node for package in PACKAGES for node in node_files(package)]
     published = {
         (c.message.rpartition('/')[2], c.topic)
-        for package in PACKAGES
-        for node in node_files(package)
+        for node in [*nodes, NodeFile(reports)]
         for c in node.connections()
-        if c.direction == 'out'
+        if c.direction == 'out' and c.message.startswith('fam_bundle_msgs/')
     }
     rows = cells(MESSAGES / 'README.md', '## Messages')
     named = {(link_texts(row[0])[0], row[1].split(' ')[0]) for row in rows}
@@ -286,6 +289,9 @@ def test_message_package_names_the_topics_that_are_published() -> None:
 def test_every_type_that_a_table_names_is_a_file(package: str) -> None:
     for row in cells(readme(package), '## Topics') + cells(readme(package), '## Services'):
         owner, kind, name = row[2].split('/')
+        if owner != 'fam_bundle_msgs':
+            assert get_package_prefix(owner)
+            continue
         assert (SOURCE / owner / kind / f'{name}.{kind}').is_file(), row[2]
 
 

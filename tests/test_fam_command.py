@@ -345,7 +345,7 @@ def test_run_starts_the_executable_in_the_sourced_environment(tree):
     assert variables['RMW_IMPLEMENTATION'] == 'rmw_fastrtps_cpp'
 
 
-@pytest.mark.parametrize('command', ['demo', 'experiment', 'bench', 'top'])
+@pytest.mark.parametrize('command', ['demo', 'experiment', 'bench', 'faults', 'top'])
 def test_commands_of_the_python_side_are_passed_on_with_their_options(tree, command):
     tree.pretend_set_up()
     status, out, _ = tree.fam(command, '-h', '--some', 'thing')

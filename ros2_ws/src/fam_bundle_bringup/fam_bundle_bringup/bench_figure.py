@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 
-from fam_bundle_io.figures_style import styled
+from fam_bundle_io.figures_style import legend_above, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,7 +54,7 @@ def draw_rates(axes: 'Axes', medians: Medians, spread: Spread) -> None:
     names = [name for name in shown if name in medians]
     values = [medians[name] for name in names]
     labels = [shown[name] for name in names]
-    axes.barh(labels, values, xerr=errors(names, medians, spread), height=0.6)
+    axes.errorbar(values, labels, xerr=errors(names, medians, spread), fmt='o', capsize=3)
     axes.set_xscale('log')
     axes.set_xlabel('ticks per second in lock-step')
 
@@ -70,7 +70,7 @@ def draw_latencies(axes: 'Axes', medians: Medians) -> None:
     axes.invert_yaxis()
     axes.set_xscale('log')
     axes.set_xlabel('sample to valve command at 1 kHz (µs)')
-    axes.legend(loc='upper left')
+    legend_above(axes, 3)
 
 
 def draw_units(axes: 'Axes', medians: Medians, spread: Spread) -> None:
@@ -82,6 +82,7 @@ def draw_units(axes: 'Axes', medians: Medians, spread: Spread) -> None:
         axes.errorbar(
             numbers, values, errors(names, medians, spread), marker='o', capsize=3, label=label
         )
+    axes.set_xticks(numbers)
     axes.set_xlabel('motor units')
     axes.set_ylabel('time per tick (µs)')
     axes.set_ylim(bottom=0.0)
@@ -97,6 +98,7 @@ def draw_bundles(axes: 'Axes', medians: Medians, spread: Spread) -> None:
         axes.errorbar(
             numbers, values, errors(names, medians, spread), marker='o', capsize=3, label=label
         )
+    axes.set_xticks(numbers)
     axes.set_xlabel('bundles side by side')
     axes.set_ylabel('ticks per second, all together')
     axes.set_ylim(bottom=0.0)

@@ -179,6 +179,22 @@ class Rig:
                 return float(due - since) * 1e-9
         return None
 
+    def stale_but_not_safe(self, since: int, limit: float) -> int:
+        """Return how many samples from ``since`` on (ns, steady) drove the valves on old commands.
+
+        Those that are not safe although none of the samples of the last ``limit`` s before was
+        ever answered.
+        """
+        answered = {s.message.tick for s in self.seen['valve_command']}
+        allowed = round(limit / self.configuration.simulation.period)
+        stale, newest = 0, None
+        for sample in (s.message for s in self.seen['bundle_state']):
+            old = newest is not None and sample.tick - newest > allowed
+            stale += sample.steady_time >= since and not sample.safe and old
+            if sample.tick in answered:
+                newest = sample.tick
+        return stale
+
     def first_tick_of_this_stretch(self) -> int:
         """Return the first tick since which the plant has followed commands."""
         first = 0

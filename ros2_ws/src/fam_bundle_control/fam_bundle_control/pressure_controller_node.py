@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from fam_bundle_control.pressure_loop import pressure_loop_step
+from fam_bundle_model.compile import direct
 from fam_bundle_model.hydraulics import TO_TANK
 from fam_bundle_model.pressure_pi import pressure_gains
 from fam_bundle_msgs.msg import BundleState, PressureReference, RecruitmentState, ValveCommand
@@ -29,7 +30,9 @@ class PressureController(Controller):
         self.integral = np.zeros(units)
         self.wanted, self.spool = np.zeros(units), np.zeros(units)
         self.saturated = np.zeros(units, dtype=np.bool_)
-        self.command(0, 0.0, 0.0, 0.0, np.zeros(units), 1.0)  # compiles the law, changes nothing
+        measured = (0, 0.0, 0.0, 0.0, np.zeros(units), 1.0)  # changes nothing
+        filled = (self.wanted, self.spool, self.saturated)
+        self.step = direct(pressure_loop_step, self.gains, self.integral, *measured, *filled)
         self.message = ValveCommand()
         self.join = TickJoin(TOPICS, self.counts, strict=not self.realtime)
         self.publisher = self.loop_publisher(ValveCommand, 'valve_command')
@@ -53,30 +56,6 @@ class PressureController(Controller):
         """Subscribe to one of the three topics."""
         self.loop_subscription(message_type, topic, self.collector(topic))
 
-    def command(
-        self,
-        recruited: int,
-        pressure: float,
-        compensation: float,
-        source_pressure: float,
-        mu_pressure: np.ndarray,
-        dt: float,
-    ) -> None:
-        """Let the law fill the references, the spool commands and their saturation."""
-        pressure_loop_step(
-            self.gains,
-            self.integral,
-            recruited,
-            pressure,
-            compensation,
-            source_pressure,
-            mu_pressure,
-            dt,
-            self.wanted,
-            self.spool,
-            self.saturated,
-        )
-
     def collector(self, topic: str) -> Callable[[Any], None]:
         """Return the callback that answers once all three messages of a tick are there."""
 
@@ -92,13 +71,18 @@ class PressureController(Controller):
     ) -> None:
         """Answer one tick."""
         dt = self.time_step(seen)
-        self.command(
+        self.step(
+            self.gains,
+            self.integral,
             recruitment.recruited,
             reference.pressure,
             recruitment.pressure_compensation,
             seen.source_pressure,
             np.array(seen.mu_pressure),
             dt,
+            self.wanted,
+            self.spool,
+            self.saturated,
         )
         if self.trouble:
             self.spool[:] = TO_TANK

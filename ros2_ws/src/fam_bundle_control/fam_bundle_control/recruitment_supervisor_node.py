@@ -6,13 +6,12 @@ import sys
 import numpy as np
 
 from fam_bundle_control.recruitment import (
-    RecruitmentOutput,
     recruitment,
     recruitment_start,
     recruitment_step,
 )
-from fam_bundle_control.recruitment import RecruitmentState as RecruitmentMemory
 from fam_bundle_model.bundle import motor_units
+from fam_bundle_model.compile import direct
 from fam_bundle_model.lag_table import PHYSICS, LagTable, lag_table_hash
 from fam_bundle_msgs.msg import BundleState, RecruitmentState
 from fam_bundle_msgs.msg import LagTable as LagTableMessage
@@ -56,34 +55,19 @@ class RecruitmentSupervisor(Controller):
             self.fail(f'lag_table: its parts do not fit together ({error})')
             return
         if first:
-            self.decide(0.0, 0.0, 0.0, np.zeros(len(self.units)), 1.0)  # compiles the law
+            model = (self.law, self.units, self.table, self.memory)
+            measured = (0.0, 0.0, 0.0, np.zeros(len(self.units)), 1.0)
+            self.decide = direct(recruitment_step, *model, *measured)
             self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state)
-
-    def decide(
-        self,
-        strain: float,
-        force: float,
-        source_pressure: float,
-        mu_pressure: np.ndarray,
-        dt: float,
-    ) -> tuple[RecruitmentMemory, RecruitmentOutput]:
-        """Return the law's next state and its output."""
-        return recruitment_step(
-            self.law,
-            self.units,
-            self.table,
-            self.memory,
-            strain,
-            force,
-            source_pressure,
-            mu_pressure,
-            dt,
-        )
 
     def on_bundle_state(self, seen: BundleState) -> None:
         """Answer one tick."""
         dt = self.time_step(seen)
         self.memory, output = self.decide(
+            self.law,
+            self.units,
+            self.table,
+            self.memory,
             seen.strain,
             seen.force,
             seen.source_pressure,

@@ -5,6 +5,7 @@ import sys
 
 from fam_bundle_control.reference import strain_reference
 from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
+from fam_bundle_model.compile import direct
 from fam_bundle_model.parameters import seconds
 from fam_bundle_msgs.msg import BundleState, PressureReference
 from fam_bundle_node.loop_node import Controller
@@ -24,7 +25,7 @@ class StrainController(Controller):
         self.message = PressureReference()
         self.restart()
         self.publisher = self.loop_publisher(PressureReference, 'pressure_reference')
-        strain_loop_step(self.law, self.state_of_law, 0.0, 0.0, 0.0, 0.0, 1.0)
+        self.step = direct(strain_loop_step, self.law, self.state_of_law, 0.0, 0.0, 0.0, 0.0, 1.0)
         self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state)
 
     def restart(self) -> None:
@@ -36,7 +37,7 @@ class StrainController(Controller):
         dt = self.time_step(seen)
         time = seconds(nanoseconds(seen.header.stamp))
         reference = strain_reference(self.configuration.reference, time)
-        self.state_of_law, output = strain_loop_step(
+        self.state_of_law, output = self.step(
             self.law,
             self.state_of_law,
             reference,

@@ -10,7 +10,7 @@ import importlib.util
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 Function = TypeVar('Function', bound=Callable[..., Any])
 
@@ -65,3 +65,20 @@ def compiled(function: Function) -> Function:
     ``FAM_BUNDLE_INTERPRET=1`` in the environment leaves every function interpreted.
     """
     return function if _DECORATOR is None else _DECORATOR(function)
+
+
+def direct(function: Function, *arguments: Any) -> Function:
+    """Return what runs ``function`` without numba's look at the types of each call.
+
+    That look takes longer than a law itself, 5 us for the supervisor's. The result is for
+    arguments of the same types as ``arguments`` only, with which ``function`` is called once
+    here: give copies of what it changes. An interpreted function is returned as it is.
+    """
+    function(*arguments)
+    if _DECORATOR is None:
+        return function
+    import numba
+
+    types = tuple(numba.typeof(argument) for argument in arguments)
+    entry: Function = cast(Any, function).overloads[types].entry_point
+    return entry

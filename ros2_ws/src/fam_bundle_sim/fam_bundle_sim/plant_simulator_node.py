@@ -9,6 +9,7 @@ import numpy as np
 from rclpy.duration import Duration
 from std_srvs.srv import Trigger
 
+from fam_bundle_model.compile import direct
 from fam_bundle_model.hydraulics import TO_TANK
 from fam_bundle_model.parameters import Configuration, seconds
 from fam_bundle_msgs.msg import BundleState, ValveCommand
@@ -77,8 +78,19 @@ class PlantSimulator(LoopNode):
         self.publisher = self.loop_publisher(BundleState, 'bundle_state')
         self.loop_subscription(ValveCommand, 'valve_command', self.on_valve_command)
         self.create_service(Trigger, '~/reset_fault', self.on_reset_fault)
-        self.advance(self.state_vector.copy(), np.zeros(units))  # compiles the plant
+        self.compile_plant()
         self.starter = self.create_steady_timer(MATCHING_PERIOD, self.start)
+
+    def compile_plant(self) -> None:
+        """Compile what each tick calls, on copies of what it changes."""
+        vented, substeps = np.zeros(len(self.spool)), self.configuration.simulation.substeps
+        state, pressure = self.state_vector.copy(), self.mu_pressure.copy()
+        still = (self.rig, state, vented, seconds(self.period_ns), substeps)
+        self.plant_step = direct(plant_step, *still)
+        self.truth = direct(truth, self.rig, state, pressure)
+        sample = np.zeros(len(self.sensors.noise))
+        true = truth(self.rig, state, pressure)
+        self.measure = direct(measure, self.sensors, true, sample, pressure)
 
     def start(self) -> None:
         """Publish tick 0 once everybody listens, and begin to look after the run."""
@@ -97,6 +109,8 @@ class PlantSimulator(LoopNode):
     def look_after(self) -> None:
         """End a run that stands still or is over."""
         super().look_after()
+        if self.done.done():
+            return
         silence = (time.monotonic_ns() - self.published_at) * 1e-9
         run = self.configuration.run
         over = self.realtime and self.period >= self.periods
@@ -171,8 +185,8 @@ class PlantSimulator(LoopNode):
 
     def publish_state(self, due: int | None = None) -> None:
         """Measure and publish the next sample, which was due (ns) or is taken now."""
-        true = truth(self.rig, self.state_vector, self.mu_pressure)
-        seen = measure(self.sensors, true, next(self.noise), self.mu_pressure)
+        true = self.truth(self.rig, self.state_vector, self.mu_pressure)
+        seen = self.measure(self.sensors, true, next(self.noise), self.mu_pressure)
         steady_time = time.monotonic_ns() if due is None else due
         self.tick += 1
         self.published_at = self.sampled_at[self.tick % SAMPLES] = steady_time
@@ -223,7 +237,7 @@ class PlantSimulator(LoopNode):
     def advance(self, state: np.ndarray, spool: np.ndarray) -> None:
         """Advance ``state`` in place by one period."""
         substeps = self.configuration.simulation.substeps
-        plant_step(self.rig, state, spool, seconds(self.period_ns), substeps)
+        self.plant_step(self.rig, state, spool, seconds(self.period_ns), substeps)
 
     def close(self) -> None:
         """End the pacing's thread."""
