@@ -31,7 +31,12 @@ from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_bringup.progress import progress_bar
 from fam_bundle_model.lag_table import build_lag_table, cached_lag_table
-from fam_bundle_model.parameters import Configuration, write_yaml
+from fam_bundle_model.parameters import (
+    Configuration,
+    ProcessParameters,
+    RunParameters,
+    write_yaml,
+)
 
 Values = dict[str, float]
 Measurement = Callable[[Configuration], Values]
@@ -439,6 +444,9 @@ def run_bench(configuration: Configuration, folder: Path, rounds: int) -> None:
     from fam_bundle_bringup.bench_figure import bench_figure
     from fam_bundle_io.figures import save_figures
 
+    configuration = dataclasses.replace(
+        configuration, run=RunParameters(), process=ProcessParameters()
+    )
     warm_up(configuration)
     values: dict[str, list[float]] = {}
     candidates = measurements()
@@ -450,6 +458,16 @@ def run_bench(configuration: Configuration, folder: Path, rounds: int) -> None:
                 progress(done * len(candidates) + number + 1)
             for name, value in {**found, **derived(found)}.items():
                 values.setdefault(name, []).append(value)
+            medians, spread = write_results(values, done + 1, folder)
+    save_figures({'bench': bench_figure(medians, spread)}, folder)
+    print_values(medians, spread, rounds)
+    print(f'written to {folder / "bench.json"} and {folder / "bench.png"}')
+
+
+def write_results(
+    values: Mapping[str, list[float]], rounds: int, folder: Path
+) -> tuple[Values, dict[str, list[float]]]:
+    """Write ``bench.json`` of the rounds until now; return medians and spread."""
     medians = {name: statistics.median(all_of) for name, all_of in values.items()}
     spread = {name: [min(all_of), max(all_of)] for name, all_of in values.items()}
     content = {
@@ -462,9 +480,7 @@ def run_bench(configuration: Configuration, folder: Path, rounds: int) -> None:
         'versions': versions(),
     }
     write_json(content, folder / 'bench.json')
-    save_figures({'bench': bench_figure(medians, spread)}, folder)
-    print_values(medians, spread, rounds)
-    print(f'written to {folder / "bench.json"} and {folder / "bench.png"}')
+    return medians, spread
 
 
 def warm_up(configuration: Configuration) -> None:

@@ -88,9 +88,8 @@ def _add_experiment(commands: Any) -> None:
     experiment.add_argument(
         '--pace',
         choices=PACES,
-        default='lockstep',
         help='through the node graph, paced by each other or by a clock, or the same loop in one '
-        'process without ROS (%(default)s)',
+        'process without ROS (default: as configured, else lockstep)',
     )
     experiment.add_argument(
         '--composed', action='store_true', help='all nodes of the graph in one process'
@@ -164,9 +163,10 @@ def run_experiment_command(options: argparse.Namespace, configuration: Configura
     from fam_bundle_bringup.progress import progress_bar
 
     scheme = configuration.recruitment.scheme
-    with progress_bar(f'{scheme}, {options.pace}', configuration.ticks()) as progress:
+    pace = options.pace or configuration.run.pace
+    with progress_bar(f'{scheme}, {pace}', configuration.ticks()) as progress:
         result = run_experiment(
-            configuration, options.pace, options.out, progress, composed=options.composed
+            configuration, pace, options.out, progress, composed=options.composed
         )
     metrics = result.metrics
     window = f'{metrics["metrics_from"]:g} to {metrics["metrics_to"]:g} s'
@@ -175,7 +175,7 @@ def run_experiment_command(options: argparse.Namespace, configuration: Configura
     print(f'  maximum error {metrics["max_error"]:.4f}')
     print(f'  upshifts      {_times(metrics["upshift_times"])}')
     print(f'  downshifts    {_times(metrics["downshift_times"])}')
-    if options.pace == 'realtime':
+    if pace == 'realtime':
         loop = metrics['loop']
         print(f'  in real time  {loop["answered"]} samples answered, {loop["late"]} of them late;')
         print(f'                {loop["skipped_periods"]} periods skipped, {loop["missing"]} lost')

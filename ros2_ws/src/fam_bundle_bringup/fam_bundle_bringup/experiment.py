@@ -156,7 +156,10 @@ def run_experiment(
         save_trace(error.trace, folder / 'trace.npz')
         raise
     save_trace(trace, folder / 'trace.npz')
-    metrics = metrics_of(configuration, pace, trace)
+    try:
+        metrics = metrics_of(configuration, pace, trace)
+    except ValueError as error:
+        raise RunFailed(f'no metrics: {error}', trace) from None
     if pace == 'realtime':
         metrics['loop'] = loop_of(json.loads((folder / 'loop_statistics.json').read_text()))
     write_json(metrics, folder / 'metrics.json')

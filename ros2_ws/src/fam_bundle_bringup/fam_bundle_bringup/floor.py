@@ -329,6 +329,7 @@ def main() -> None:
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         node.spin()
     if node.done.done():
+        node.done.result()  # raises what went wrong on the clock
         print(node.trips.report(), flush=True)
     rclpy.try_shutdown()
 

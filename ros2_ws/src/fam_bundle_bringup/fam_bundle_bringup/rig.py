@@ -2,6 +2,7 @@
 """The graph in real time under observation: nodes that can be hurt, and all that they said."""
 
 import contextlib
+import math
 import signal
 import subprocess
 import time
@@ -18,6 +19,7 @@ from fam_bundle_node.stamps import nanoseconds
 PACKAGES = {name: package for package, name in NODES}
 PATIENCE = 60.0  # s; only a hang takes that long
 SLICE = 0.02  # s
+STEADY = 200  # samples in a row that make a running loop
 
 
 class Seen(NamedTuple):
@@ -168,8 +170,25 @@ class Rig:
         """Return whether commands have been coming and the newest samples are not safe."""
         states, commands = self.seen['bundle_state'], self.seen['valve_command']
         recent = time.monotonic_ns() - 500_000_000
-        steady = len(states) > 200 and not any(s.message.safe for s in states[-200:])
+        newest = [s.message for s in states[-STEADY:]]
+        # Of one run: tick 0 begins another.
+        one_run = len(newest) == STEADY and newest[-1].tick - newest[0].tick == STEADY - 1
+        steady = one_run and not any(message.safe for message in newest)
         return bool(steady and commands and min(states[-1].at, commands[-1].at) > recent)
+
+    def ended(self) -> list[str]:
+        """Return the nodes that have ended without being killed by a signal of ours."""
+        return [n for n, p in self.nodes.items() if p.poll() not in (None, -signal.SIGKILL)]
+
+    def last_line(self, name: str) -> str:
+        """Return the last line that a node printed."""
+        lines = (self._folder / 'log' / f'{name}.log').read_text(errors='replace').splitlines()
+        return lines[-1].strip() if lines else ''
+
+    def vented_to(self, since: int) -> float:
+        """Return the lowest that the fullest motor unit came to while safe (Pa), from then on."""
+        safe = [s.message for s in self.seen['bundle_state'] if s.message.safe and s.at >= since]
+        return min((max(message.mu_pressure) for message in safe), default=math.inf)
 
     def safe_after(self, since: int) -> float | None:
         """Return how long after ``since`` (ns, steady) the first safe sample was due (s)."""
@@ -197,12 +216,12 @@ class Rig:
 
     def first_tick_of_this_stretch(self) -> int:
         """Return the first tick since which the plant has followed commands."""
-        first = 0
+        first = int(self.seen['bundle_state'][-1].message.tick)
         for sample in reversed(self.seen['bundle_state']):
-            if sample.message.safe or sample.message.tick > first > 0:
+            if sample.message.safe or sample.message.tick > first:
                 break
-            first = sample.message.tick
-        return int(first)
+            first = int(sample.message.tick)
+        return first
 
     def messages(self, topic: str, since: int, until: int | None = None) -> list[Any]:
         """Return what came on ``topic`` from ``since`` on (ns, steady), before ``until``."""

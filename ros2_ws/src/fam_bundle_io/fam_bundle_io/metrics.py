@@ -18,8 +18,8 @@ class Tracking(NamedTuple):
 def tracking(trace: Trace, start: float, stop: float) -> Tracking:
     """Return the metrics over ``start <= time < stop`` (s).
 
-    Each tick stands for the time until the next one, the last for as long as the first: in real
-    time periods can be skipped.
+    Each tick stands for the time until the next one, or until ``stop``: in real time periods can
+    be skipped.
 
     Raises ValueError when the trace has fewer than two ticks in that window.
     """
@@ -28,8 +28,7 @@ def tracking(trace: Trace, start: float, stop: float) -> Tracking:
     if np.count_nonzero(window) < 2:
         raise ValueError(f'the trace has no ticks from {start:g} s to {stop:g} s')
     error = np.abs(trace['strain_reference'] - trace['strain'])[window]
-    step = np.diff(time[window], append=np.nan)
-    step[-1] = step[0]
+    step = np.diff(time[window], append=stop)
     return Tracking(float((error * step).sum()), float(error.max()))
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
@@ -43,7 +44,8 @@ class TraceRecorder(Node):
         for topic in TOPICS:
             if topic != 'bundle_state':
                 self.listen(topic)
-        self._timer = self.create_timer(0.02, self.start)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self.create_timer(0.02, self.start, clock=steady)
 
     def start(self) -> None:
         """Listen to the plant once every other topic has its publisher."""

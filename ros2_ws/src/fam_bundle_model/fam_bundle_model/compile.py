@@ -79,6 +79,7 @@ def direct(function: Function, *arguments: Any) -> Function:
         return function
     import numba
 
-    types = tuple(numba.typeof(argument) for argument in arguments)
+    type_of = cast(Callable[[Any], Any], numba.typeof)
+    types = tuple(type_of(argument) for argument in arguments)
     entry: Function = cast(Any, function).overloads[types].entry_point
     return entry

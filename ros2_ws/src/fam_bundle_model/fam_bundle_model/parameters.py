@@ -316,6 +316,10 @@ def check_run(run: RunParameters, simulation: SimulationParameters) -> None:
             f'run.command_timeout = {run.command_timeout:g} s: must be >= '
             f'{2.0 * simulation.period:g} s, two periods'
         )
+    if run.busy_tail >= simulation.period:
+        raise ConfigurationError(
+            f'run.busy_tail = {run.busy_tail:g} s: must be < {simulation.period:g} s, the period'
+        )
 
 
 def check_fam(fam: FamParameters) -> None:

@@ -4,12 +4,14 @@
 Owned by whoever has the valves, the plant simulator or the hardware bridge.
 """
 
+from collections import deque
+
 
 class CommandWatch:
     """Safe while commands stay away; latched after a fault.
 
-    Counts samples, not time, so that a schedule which was itself held up does not blame the
-    controllers.
+    Counts samples first, so that a schedule which was itself held up does not blame the
+    controllers; but valves that stay on one command for twice the time are safe in any case.
     """
 
     def __init__(self, limit: int) -> None:
@@ -23,6 +25,9 @@ class CommandWatch:
         self.reason = ''
         self._answered = self._answered_before = -1
         self._in_time = 0
+        self._period = 0
+        # Tick and period of the newest answered sample, and of those that wait for an answer.
+        self._samples: deque[tuple[int, int]] = deque([(-1, 0)], maxlen=4 * limit)
 
     @property
     def safe(self) -> bool:
@@ -41,7 +46,11 @@ class CommandWatch:
 
     def next_sample(self, tick: int, periods: int) -> None:
         """Decide before sample ``tick`` is taken, ``periods`` periods after the last one."""
-        answered = tick - self._answered < self.limit
+        self._period += periods
+        while len(self._samples) > 1 and self._samples[1][0] <= self._answered:
+            self._samples.popleft()
+        self._samples.append((tick, self._period))
+        answered = tick - self._answered < self.limit and self.held_for() < 2 * self.limit
         came = self._answered > self._answered_before
         self._in_time = self._in_time + 1 if came else 0
         self._answered_before = self._answered
@@ -51,6 +60,10 @@ class CommandWatch:
             self._go_safe(f'valve_command: no answer since tick {self._answered}')
         elif self._in_time >= self.limit:
             self.reason = ''
+
+    def held_for(self) -> int:
+        """Return for how many periods the newest command has been held, by the newest sample."""
+        return self._period - self._samples[0][1]
 
     def latch(self, reason: str) -> None:
         """Go safe for good; the first reason stays."""

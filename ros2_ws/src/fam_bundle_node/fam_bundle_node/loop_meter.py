@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """How well a node keeps up: rate, latencies, CPU time, and what went wrong. No ROS."""
 
+import math
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
-
-import numpy as np
 
 from fam_bundle_node.ticks import TickCounts
 
 NANOSECONDS = 1e-9
-HISTOGRAM = 100_000  # us
+SHARES = (0.5, 0.99, 1.0)
 # A first sample of another age was stamped by another machine's clock.
 OLDEST_FIRST_SAMPLE = 5_000_000_000  # ns
 
@@ -40,6 +40,8 @@ class WholeRun(NamedTuple):
 
     def words(self) -> str:
         """Return the same in words, for a log."""
+        if not self.answered or math.isnan(self.latency_p50):
+            return 'none answered'
         p50, p99, largest = (round(1e6 * latency) for latency in self[3:])
         return (
             f'{self.answered} answered, {self.in_time} within a period, '
@@ -63,9 +65,8 @@ class LoopMeter:
         self._latencies: list[int] = []
         self._begin, self._cpu_begin, self._ticks_begin = clock(), cpu(), 0
         self._comparable: bool | None = None
-        # One count for each microsecond, the last one for all above: a run may last for days.
-        self._histogram = np.zeros(HISTOGRAM, dtype=np.int64)
-        self._longest = 0.0
+        # Counts by whole microseconds: a run may last for days.
+        self._histogram: Counter[int] = Counter()
 
     def age(self, steady_time: int) -> int | None:
         """Return how long ago ``steady_time`` was (ns), or None if it is another machine's."""
@@ -98,9 +99,9 @@ class LoopMeter:
         done = ticks - self._ticks_begin
         spent = (cpu - self._cpu_begin) * NANOSECONDS
         self._begin, self._cpu_begin, self._ticks_begin = now, cpu, ticks
-        self._keep(latencies)
-        found = np.array(latencies or [np.nan]) * NANOSECONDS
-        p50, p99, largest = np.percentile(found, (50.0, 99.0, 100.0)).tolist()
+        self._histogram.update(latency // 1000 for latency in latencies)
+        latencies.sort()
+        p50, p99, largest = (quantile(latencies, share) * NANOSECONDS for share in SHARES)
         return LoopReport(
             interval,
             ticks,
@@ -112,19 +113,33 @@ class LoopMeter:
             spent / interval,
         )
 
-    def _keep(self, latencies: list[int]) -> None:
-        if latencies:
-            microseconds = np.minimum(np.array(latencies) // 1000, HISTOGRAM - 1)
-            self._histogram += np.bincount(microseconds, minlength=HISTOGRAM)
-            self._longest = max(self._longest, max(latencies) * NANOSECONDS)
+    def forget_clock(self) -> None:
+        """Find out anew whether the samples are stamped by this machine's clock."""
+        self._comparable = None
 
     def whole_run(self, period: int) -> WholeRun:
         """Return the sums over all reports, latencies to 1 us; ``period`` in ns."""
-        reached = np.cumsum(self._histogram)
-        ranks = (0.5 * reached[-1], 0.99 * reached[-1])
-        p50, p99 = (float(np.searchsorted(reached, rank)) * 1e-6 for rank in ranks)
-        within = min(period // 1000, HISTOGRAM) - 1
-        in_time = int(reached[within])
-        return WholeRun(
-            self.ticks, in_time, self.skipped_periods, p50, min(p99, self._longest), self._longest
-        )
+        found = sorted(self._histogram.items())
+        in_time = sum(count for latency, count in found if latency * 1000 < period)
+        total, reached = sum(self._histogram.values()), 0
+        ranks = [share * total for share in SHARES]
+        latencies = [math.nan] * len(SHARES)
+        for latency, count in found:
+            for i, rank in enumerate(ranks):
+                if reached < rank <= reached + count:
+                    latencies[i] = latency * 1e-6
+            reached += count
+        return WholeRun(self.ticks, in_time, self.skipped_periods, *latencies)
+
+
+def quantile(ordered: list[int], share: float) -> float:
+    """Return the value that ``share`` of the ``ordered`` ones do not exceed, or NaN of none.
+
+    Interpolates linearly between two ranks.
+    """
+    if not ordered:
+        return math.nan
+    rank = share * (len(ordered) - 1)
+    low = math.floor(rank)
+    high = min(low + 1, len(ordered) - 1)
+    return ordered[low] + (rank - low) * (ordered[high] - ordered[low])

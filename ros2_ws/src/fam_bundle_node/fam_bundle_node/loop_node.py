@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every node of the loop shares: parameters, admission of messages, statistics, errors."""
 
+import re
 import time
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -26,6 +27,7 @@ REPORT_PERIOD = 1.0  # s
 LOOK_PERIOD = 0.05  # s between two looks at how the node does
 SILENCE = 0.2  # s without a tick, after which a controller says what it waits for
 STALE = 5.0  # command time-outs; nobody waits for the answer to an older sample
+NUMBERS = re.compile(r'\d+')
 FUTURE = -1_000_000  # ns; a sample that is stamped further ahead than this was not taken
 
 
@@ -100,6 +102,8 @@ class LoopNode(Node):
             try:
                 CHECKS[topic](message, self.motor_units())
                 if ticks is None or (self._is_fresh(message) and ticks.admit(message.tick)):
+                    if ticks is not None and message.tick == 0:
+                        self.trouble, self._strikes = '', Strikes()  # of the run before
                     callback(message)
                 reason = f'{topic}: tick {message.tick} came twice or out of order'
             except TickError as error:
@@ -119,8 +123,9 @@ class LoopNode(Node):
 
     def _is_fresh(self, sample: Any) -> bool:
         """Return whether a sample is of now, and count it if it is late."""
-        if sample.tick == 0:  # waits for its answer, but must not be of a run that was before
-            late = sample.steady_time <= self._newest
+        if sample.tick == 0:  # waits for its answer, however long; a new run may have a new clock
+            late = sample.steady_time == self._newest
+            self.meter.forget_clock()
         else:
             age = self.meter.age(sample.steady_time)
             if age is None:
@@ -150,11 +155,12 @@ class LoopNode(Node):
     def look_after(self) -> None:
         """Report once a second, and at once when the state changes."""
         state = self.state()
-        if state == self._shown and time.monotonic() - self._reported_at < REPORT_PERIOD:
+        kind = NUMBERS.sub('', state)  # the tick it waits for may rise with each look
+        if kind == self._shown and time.monotonic() - self._reported_at < REPORT_PERIOD:
             return
-        if state != self._shown:
+        if kind != self._shown:
             self.get_logger().warning(state)
-        self._shown = state
+        self._shown = kind
         self.report()
 
     def report(self) -> None:

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs nodes of the loop in this process until they are done: executor, tuning, exit status."""
 
-import contextlib
 import sys
 from collections.abc import Callable, Sequence
 
@@ -55,8 +54,13 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
         rclpy.try_shutdown()
         return INTERRUPTED
     done = first_done(nodes)
-    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+    try:
         spin(nodes, done)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except rclpy_implementation.RCLError:
+        if rclpy.ok():  # else a callback was about to publish when a signal ended the context
+            raise
     for node in nodes:
         node.close()
     status: int = done.result() if done.done() else INTERRUPTED

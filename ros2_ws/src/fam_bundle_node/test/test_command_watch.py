@@ -112,11 +112,13 @@ def test_another_hold_up_begins_the_wait_anew():
 def test_no_stale_command_is_followed_and_nothing_else_is_a_reason(limit, story):
     """Each sample of the story comes after some periods; its answer belongs to an older one."""
     rig = Rig(limit)
-    answered, cause = rig.newest, False
+    answered, cause, taken = rig.newest, False, {rig.newest: 0}
     for delay, periods in story:
-        behind = rig.newest + 1 - answered >= limit
+        period = taken[rig.newest] + periods
+        behind = rig.newest + 1 - answered >= limit or period - taken[answered] >= 2 * limit
         cause = cause or behind or periods > limit
         safe = rig.sample(periods)
+        taken[rig.newest] = period
         assert safe or not (behind or periods > limit)
         assert cause or not safe
         if delay is not None:
@@ -191,3 +193,16 @@ def test_two_answers_after_a_silence_do_not_end_the_safe_state():
     for tick in range(22, 40):
         watch.next_sample(tick, 1)
         assert watch.safe
+
+
+def test_a_stuttering_schedule_does_not_hold_an_old_command_for_long():
+    """Neither rule alone would end it: few samples, and no hold-up beyond the limit."""
+    watch = CommandWatch(20)
+    watch.answer(0)
+    held = 0
+    for tick in range(1, 20):
+        watch.next_sample(tick, 19)
+        if watch.safe:
+            break
+        held += 19
+    assert held < 2 * 20

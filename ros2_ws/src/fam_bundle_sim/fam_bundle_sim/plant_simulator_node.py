@@ -124,7 +124,11 @@ class PlantSimulator(LoopNode):
             self.fail(f'valve_command: tick {self.tick} has not come within {timeout}')
 
     def state(self) -> str:
-        """Return 'running', or why the plant is safe."""
+        """Return 'running', or what the plant waits for, or why it is safe."""
+        if self.tick < 0:
+            return f'waiting for {self.configuration.run.listeners} listeners of bundle_state'
+        if self.answered < 0:
+            return 'waiting for valve_command of tick 0'
         return self.watch.state()
 
     def on_valve_command(self, command: ValveCommand) -> None:
@@ -169,7 +173,7 @@ class PlantSimulator(LoopNode):
         """Advance by ``periods``, more than 1 after an overrun, and publish the next sample."""
         self.meter.skipped(periods)
         with self.lock:
-            safe, spool = self.watch.safe, self.spool
+            safe, spool, held_for = self.watch.safe, self.spool, self.watch.held_for()
             if self.realtime:
                 self.watch.next_sample(self.tick + 1, periods)
         self.period += periods
@@ -179,7 +183,8 @@ class PlantSimulator(LoopNode):
         vented = np.full(len(spool), TO_TANK)
         for passed in range(periods):
             # A hold-up longer than the time-out: as a rig's watchdog would do.
-            held = not safe and passed < self.watch.limit
+            limit = self.watch.limit
+            held = not safe and passed < limit and held_for + passed < 2 * limit
             self.advance(self.state_vector, spool if held else vented)
         self.publish_state(self.pacing.due)
 
