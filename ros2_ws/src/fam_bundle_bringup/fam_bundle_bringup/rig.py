@@ -101,14 +101,22 @@ class Rig:
     def _subscribe(self, node: Any) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
 
-        from fam_bundle_io.trace_recorder_node import TOPICS
-        from fam_bundle_node.qos import RECORDER_SUBSCRIPTION, REPORTS
+        from fam_bundle_node.qos import REPORTS
 
-        for topic, message_type in TOPICS.items():
-            node.create_subscription(
-                message_type, topic, self._keeper(topic), RECORDER_SUBSCRIPTION
-            )
+        self.node = node
+        for topic in ('bundle_state', 'valve_command'):  # all would cost the loop too much
+            self.watch(topic)
         node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, REPORTS)
+
+    def watch(self, topic: str) -> None:
+        """Keep what comes on ``topic`` from now on."""
+        from fam_bundle_io.trace_recorder_node import TOPICS
+        from fam_bundle_node.qos import RECORDER_SUBSCRIPTION
+
+        if topic not in self.seen:
+            self.node.create_subscription(
+                TOPICS[topic], topic, self._keeper(topic), RECORDER_SUBSCRIPTION
+            )
 
     def _keeper(self, topic: str) -> Callable[[Any], None]:
         kept = self.seen.setdefault(topic, [])

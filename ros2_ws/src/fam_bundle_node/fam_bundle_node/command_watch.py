@@ -23,6 +23,7 @@ class CommandWatch:
         self.limit = limit
         self.fault = ''
         self.reason = ''
+        self._news = ''
         self._answered = self._answered_before = -1
         self._in_time = 0
         self._period = 0
@@ -75,6 +76,12 @@ class CommandWatch:
             self._go_safe(f'{self.fault}; reset, waiting for commands')
         self.fault = ''
 
+    def take_news(self) -> str:
+        """Return why it has gone safe since the last call, or nothing: it may be over again."""
+        news, self._news = self._news, ''
+        return f'safe: {news}' if news else ''
+
     def _go_safe(self, reason: str) -> None:
+        self._news = '' if self.reason else reason
         self.reason = reason
         self._in_time = 0

@@ -131,6 +131,10 @@ class PlantSimulator(LoopNode):
             return 'waiting for valve_command of tick 0'
         return self.watch.state()
 
+    def news(self) -> str:
+        """Return why the plant has been safe since the last look: it may follow commands again."""
+        return self.watch.take_news()
+
     def on_valve_command(self, command: ValveCommand) -> None:
         """Hold the command; go on where the pacing waits for it."""
         if not self.is_answer(command):
