@@ -17,15 +17,15 @@ class CommandWatch:
     def __init__(self, limit: int) -> None:
         """Go safe when the newest answer is ``limit`` samples old; ``limit`` is 2 or more.
 
-        A new answer at each of as many samples in a row ends it. Not safe at first: its owner
-        begins when the loop has closed.
+        Answers that keep coming for as many samples, never a fifth of it apart, end it. Not safe
+        at first: its owner begins when the loop has closed.
         """
         self.limit = limit
         self.fault = ''
         self.reason = ''
         self._news = ''
         self._answered = self._answered_before = -1
-        self._in_time = 0
+        self._regular = self._silent = 0
         self._period = 0
         # Tick and period of the newest answered sample, and of those that wait for an answer.
         self._samples: deque[tuple[int, int]] = deque([(-1, 0)], maxlen=4 * limit)
@@ -53,13 +53,15 @@ class CommandWatch:
         self._samples.append((tick, self._period))
         answered = tick - self._answered < self.limit and self.held_for() < 2 * self.limit
         came = self._answered > self._answered_before
-        self._in_time = self._in_time + 1 if came else 0
+        self._silent = 0 if came else self._silent + 1
+        # An answer may come just after the next sample: a few silent ones are still regular.
+        self._regular = self._regular + 1 if self._silent <= self.limit // 5 else 0
         self._answered_before = self._answered
         if periods > self.limit:
             self._go_safe(f'the schedule was held up for {periods} periods before tick {tick}')
         elif not answered:
             self._go_safe(f'valve_command: no answer since tick {self._answered}')
-        elif self._in_time >= self.limit:
+        elif self._regular >= self.limit:
             self.reason = ''
 
     def held_for(self) -> int:
@@ -84,4 +86,4 @@ class CommandWatch:
     def _go_safe(self, reason: str) -> None:
         self._news = '' if self.reason else reason
         self.reason = reason
-        self._in_time = 0
+        self._regular = self._silent = 0

@@ -206,3 +206,14 @@ def test_a_stuttering_schedule_does_not_hold_an_old_command_for_long():
             break
         held += 19
     assert held < 2 * 20
+
+
+def test_answers_that_jitter_around_the_next_sample_end_the_safe_state():
+    watch = CommandWatch(20)
+    for tick in range(1, 40):
+        watch.next_sample(tick, 1)
+    assert watch.safe
+    for tick in range(40, 80):
+        watch.answer(tick - 1 - tick % 2)  # every other answer comes after the next sample
+        watch.next_sample(tick, 1)
+    assert not watch.safe
