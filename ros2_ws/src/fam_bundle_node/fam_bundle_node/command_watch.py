@@ -84,6 +84,7 @@ class CommandWatch:
         return f'safe: {news}' if news else ''
 
     def _go_safe(self, reason: str) -> None:
-        self._news = '' if self.reason else reason
+        if not self.reason:
+            self._news = reason
         self.reason = reason
         self._regular = self._silent = 0

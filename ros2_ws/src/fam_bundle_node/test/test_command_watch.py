@@ -217,3 +217,15 @@ def test_answers_that_jitter_around_the_next_sample_end_the_safe_state():
         watch.answer(tick - 1 - tick % 2)  # every other answer comes after the next sample
         watch.next_sample(tick, 1)
     assert not watch.safe
+
+
+def test_a_short_safe_state_is_news_even_when_it_is_over():
+    watch = CommandWatch(5)
+    watch.answer(0)
+    watch.next_sample(1, 100)
+    for tick in range(2, 20):
+        watch.answer(tick - 1)
+        watch.next_sample(tick, 1)
+    assert not watch.safe
+    assert watch.take_news().startswith('safe: the schedule was held up for 100 periods')
+    assert watch.take_news() == ''
