@@ -68,43 +68,39 @@ def draw_latencies(axes: 'Axes', medians: Medians, spread: Spread) -> None:
         axes.plot(found, list(rows.values()), marker, label=label)
     # A longer run has a larger maximum: only those that last equally long, and of all rounds.
     longest = [spread[f'{name}_latency_max_us'][1] for name in LONG_RUNS]
-    axes.plot(longest, [rows[name] for name in LONG_RUNS], 'x', label='largest of all rounds')
+    axes.plot(longest, [rows[name] for name in LONG_RUNS], 'x', label='largest')
     axes.axvline(1000.0, linestyle='--', color='0.4', linewidth=1.0)
     axes.set_yticks(list(rows.values()), list(ON_A_CLOCK.values()))
     axes.invert_yaxis()
     axes.set_xscale('log')
-    axes.set_xlabel('at 1 kHz, sample to valve command; machine: lateness (µs)')
+    axes.set_xlabel('latency at 1 kHz; machine: lateness (µs)')
     legend_above(axes, 3)
 
 
 def draw_units(axes: 'Axes', medians: Medians, spread: Spread) -> None:
     """Draw the time per tick over the number of motor units."""
-    for kind, label in (('lockstep', 'five processes'), ('composed', 'one process')):
-        names = [name for name in medians if name.startswith(f'{kind}_') and 'units_tick' in name]
-        numbers = [int(name.split('_')[1]) for name in names]
-        values = [medians[name] for name in names]
-        axes.errorbar(
-            numbers, values, errors(names, medians, spread), marker='o', capsize=3, label=label
-        )
-    axes.set_xticks(numbers)
+    draw_over(axes, '_units_tick_us', medians, spread)
     axes.set_xlabel('motor units')
     axes.set_ylabel('time per tick (µs)')
-    axes.set_ylim(bottom=0.0)
-    axes.legend()
 
 
 def draw_bundles(axes: 'Axes', medians: Medians, spread: Spread) -> None:
     """Draw the ticks per second of several bundles together."""
+    draw_over(axes, '_bundles_ticks_per_second', medians, spread)
+    axes.set_xlabel('bundles side by side')
+    axes.set_ylabel('ticks per second, all together')
+
+
+def draw_over(axes: 'Axes', ending: str, medians: Medians, spread: Spread) -> None:
+    """Draw ``KIND_NUMBER`` + ``ending`` over its number, one line for each arrangement."""
     for kind, label in (('lockstep', 'five processes each'), ('composed', 'one process each')):
-        names = [name for name in medians if name.startswith(f'{kind}_') and '_bundles_' in name]
+        names = [name for name in medians if name.startswith(f'{kind}_') and ending in name]
         numbers = [int(name.split('_')[1]) for name in names]
         values = [medians[name] for name in names]
         axes.errorbar(
             numbers, values, errors(names, medians, spread), marker='o', capsize=3, label=label
         )
     axes.set_xticks(numbers)
-    axes.set_xlabel('bundles side by side')
-    axes.set_ylabel('ticks per second, all together')
     axes.set_ylim(bottom=0.0)
     axes.legend()
 

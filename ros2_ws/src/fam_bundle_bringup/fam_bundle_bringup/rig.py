@@ -231,10 +231,9 @@ class Rig:
             first = int(sample.message.tick)
         return first
 
-    def messages(self, topic: str, since: int, until: int | None = None) -> list[Any]:
-        """Return what came on ``topic`` from ``since`` on (ns, steady), before ``until``."""
-        end = until or time.monotonic_ns()
-        return [s.message for s in self.seen[topic] if since <= s.at < end]
+    def messages(self, topic: str, since: int) -> list[Any]:
+        """Return what came on ``topic`` from ``since`` on (ns, steady)."""
+        return [s.message for s in self.seen[topic] if since <= s.at]
 
     def reason(self, since: int, *words: str) -> str:
         """Return the first trouble on /diagnostics since then (ns) that holds one of ``words``."""

@@ -7,6 +7,9 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+from fam_bundle_model.parameters import seconds
+from fam_bundle_node.stamps import nanoseconds
+
 LOOK_PERIOD = 0.5  # s between two looks for new topics
 TYPE = 'fam_bundle_msgs/msg/LoopStatistics'
 
@@ -37,7 +40,7 @@ class Report(NamedTuple):
 def report_of(message: Any, received: float) -> Report:
     """Return what a LoopStatistics that came at ``received`` says."""
     same = {name: getattr(message, name) for name in Report._fields[4:]}
-    stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
+    stamp = seconds(nanoseconds(message.header.stamp))
     return Report(received, stamp, _clean(message.node), _clean(message.state), **same)
 
 
