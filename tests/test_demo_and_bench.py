@@ -74,7 +74,7 @@ def test_bench_measures_every_candidate(
     for name, value in {
         'TICKS': 200,
         'TURNS': 1,
-        'SLOW_TICKS': 50,
+        'SLOW_TICKS': 200,
         'SOCKET_TICKS': 1000,
         'BUNDLE_TICKS': 200,
         'COMPOSED_BUNDLE_TICKS': 200,

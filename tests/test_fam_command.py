@@ -97,7 +97,7 @@ class Tree:
         (install / 'fam_environment.json').write_text(
             '{"PATH": "/sourced:", "PYTHONPATH": "/ours"}'
         )
-        for step in self.module().plan(False, False):
+        for step in self.module().plan(False, True):
             step.stamp.write_text(step.digest)
 
     def build_is_due(self, colcon):
