@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from fam_bundle_bringup.experiment import default_configuration
-from fam_bundle_bringup.faults import first_bump, inject, not_finite
 from fam_bundle_bringup.graph import (
     LOOP_LISTENERS,
     drain,
@@ -26,9 +25,11 @@ from fam_bundle_bringup.graph import (
     run_graph,
     start_nodes,
 )
+from fam_bundle_bringup.message_faults import inject, not_finite
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_bringup.processes import executable
 from fam_bundle_bringup.rig import Rig
+from fam_bundle_bringup.verdicts import first_bump
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration, write_yaml
 

@@ -5,7 +5,7 @@ import contextlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fam_bundle_bringup.domain_marker import marked
 from fam_bundle_bringup.failure import RunFailed
@@ -132,22 +132,39 @@ def recording(
 
     A bundle is named by its namespace; all recorders are in this process.
     """
+
+    def make() -> list['TraceRecorder']:
+        from fam_bundle_io.trace_recorder_node import TraceRecorder
+
+        return [TraceRecorder(bundle) for bundle in bundles]
+
+    with listening(make) as found:
+        yield found
+
+
+@contextlib.contextmanager
+def listening(
+    make: Callable[[], list[Any]],
+) -> Iterator[tuple[list[Any], Callable[[float], None]]]:
+    """Give the nodes that ``make`` returns, in this process, and a function that runs them.
+
+    It takes for how long (s).
+    """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
     from rclpy.task import Future
 
-    from fam_bundle_io.trace_recorder_node import TraceRecorder
     from fam_bundle_node.run import make_executor
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     with contextlib.ExitStack() as stack:
         stack.callback(rclpy.try_shutdown)
-        never, recorders = Future(), [TraceRecorder(bundle) for bundle in bundles]
-        for recorder in recorders:
+        never, nodes = Future(), make()
+        for node in nodes:
             # Else its subscriptions live on and hold the next run up.
-            stack.callback(recorder.destroy_node)
+            stack.callback(node.destroy_node)
         executor = make_executor()
         stack.callback(executor.shutdown)
-        for recorder in recorders:
-            executor.add_node(recorder)
-        yield recorders, lambda wait: executor.spin_until_future_complete(never, timeout_sec=wait)
+        for node in nodes:
+            executor.add_node(node)
+        yield nodes, lambda wait: executor.spin_until_future_complete(never, timeout_sec=wait)

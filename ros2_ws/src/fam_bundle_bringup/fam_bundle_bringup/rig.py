@@ -2,16 +2,23 @@
 """The graph in real time under observation: nodes that can be hurt, and all that they said."""
 
 import contextlib
+import gc
 import math
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
 
-from fam_bundle_bringup.graph import LOOP_LISTENERS, NODES, nodes_in, own_domain
+from fam_bundle_bringup.graph import (
+    LOOP_LISTENERS,
+    NODES,
+    listening,
+    nodes_in,
+    own_domain,
+)
 from fam_bundle_bringup.processes import executable
 from fam_bundle_model.parameters import Configuration, write_yaml
 from fam_bundle_node.stamps import nanoseconds
@@ -30,9 +37,14 @@ class Seen(NamedTuple):
 
 
 class Report(NamedTuple):
-    """One status from /diagnostics: when it came (ns, steady), and its stamp (s, system)."""
+    """One status from /diagnostics.
+
+    ``at`` (ns, steady) and ``at_system`` (s, system) tell when it came; ``stamp`` (s, system) is
+    its own.
+    """
 
     at: int
+    at_system: float
     stamp: float
     node: str
     error: bool
@@ -59,7 +71,11 @@ class Rig:
         """Listen, and have no node yet."""
         try:
             self._stack.enter_context(own_domain())
-            self.listen, self.node = self._stack.enter_context(self._listening())
+            # A collection among all that was seen would hold the observer up for a tenth of a
+            # second, and with it the loop, which sends again what it has not taken.
+            gc.disable()
+            self._stack.callback(gc.enable)
+            (self.node,), self.listen = self._stack.enter_context(listening(self._observer))
             self.group = self._stack.enter_context(nodes_in(self._folder))
         except BaseException:
             self._stack.close()
@@ -75,28 +91,12 @@ class Rig:
         """End all processes."""
         self._stack.close()
 
-    @contextlib.contextmanager
-    def _listening(self) -> Iterator[tuple[Callable[[float], None], Any]]:
-        import rclpy
+    def _observer(self) -> list[Any]:
         from rclpy.node import Node
-        from rclpy.signals import SignalHandlerOptions
-        from rclpy.task import Future
 
-        from fam_bundle_node.run import make_executor
-
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        with contextlib.ExitStack() as stack:
-            stack.callback(rclpy.try_shutdown)
-            node, never = Node('fault_observer'), Future()
-            stack.callback(node.destroy_node)
-            self._subscribe(node)
-            executor = make_executor()
-            stack.callback(executor.shutdown)
-            executor.add_node(node)
-            yield (
-                lambda wait: executor.spin_until_future_complete(never, timeout_sec=wait),
-                node,
-            )
+        node = Node('fault_observer')
+        self._subscribe(node)
+        return [node]
 
     def _subscribe(self, node: Any) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
@@ -133,7 +133,15 @@ class Rig:
             error = status.level != status.OK and status.message != 'running'
             stamp = nanoseconds(array.header.stamp) * 1e-9
             self.reports.append(
-                Report(time.monotonic_ns(), stamp, node, error, status.message, values)
+                Report(
+                    time.monotonic_ns(),
+                    time.time(),
+                    stamp,
+                    node,
+                    error,
+                    status.message,
+                    values,
+                )
             )
 
     def start(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.task import Future
@@ -21,6 +22,7 @@ from fam_bundle_node.stamps import StampClock
 from fam_bundle_node.statistics_publisher import StatisticsPublisher
 from fam_bundle_node.ticks import Strikes, TickCounts, TickError, TickFilter, TickOrder
 
+RCLError = rclpy_implementation.RCLError
 # Parameter groups that every node of the loop declares.
 COMMON = ('run', 'process')
 REPORT_PERIOD = 1.0  # s
@@ -77,8 +79,13 @@ class LoopNode(Node):
         admit = self._in_real_time(topic) if self.realtime else self._in_lockstep(topic)
 
         def received(message: Any) -> None:
-            if not self.done.done():
+            if self.done.done():
+                return
+            try:
                 admit(message, callback)
+            except RCLError:
+                if self.context.ok():  # else a signal has ended the context meanwhile
+                    raise
 
         quality = REALTIME_SUBSCRIPTION if self.realtime else LOOP_SUBSCRIPTION
         self.create_subscription(message_type, topic, received, quality)

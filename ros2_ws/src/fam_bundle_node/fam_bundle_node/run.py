@@ -58,8 +58,8 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
         spin(nodes, done)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except rclpy_implementation.RCLError:
-        if rclpy.ok():  # else a callback was about to publish when a signal ended the context
+    except RuntimeError:  # of rcl or of the executor's C++
+        if rclpy.ok():  # else a callback was under way when a signal ended the context
             raise
     for node in nodes:
         node.close()

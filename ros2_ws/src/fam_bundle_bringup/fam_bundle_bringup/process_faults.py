@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes that are killed, held up, restarted or there twice."""
+
+import itertools
+import signal
+import time
+from collections import Counter
+
+from fam_bundle_bringup.rig import Rig
+from fam_bundle_bringup.verdicts import (
+    AFTER,
+    IN_TIME,
+    SAFE_WITHIN,
+    VENTED,
+    Fault,
+    both,
+    goes_on,
+    harmless_or_safe,
+    reset,
+    safe_and_said,
+)
+
+STOPPED = 0.5  # s that a node is held up
+
+WAITS = {
+    'recruitment_supervisor': 'recruitment_state',
+    'strain_controller': 'pressure_reference',
+    'pressure_controller': 'no answer',
+}
+
+
+def killed(name: str) -> Fault:
+    """Return the fault that a controller is killed, and started again."""
+
+    def hurt(rig: Rig) -> tuple[str, bool]:
+        since = rig.signal(name, signal.SIGKILL)
+        stopped = safe_and_said(rig, since, WAITS[name])
+        rig.start(name)
+        return both(stopped, goes_on(rig))
+
+    expected = f'{IN_TIME}; after its restart the run goes on without a bump'
+    return Fault(f'kill -9 and restart: {name}', expected, hurt)
+
+
+def killed_server(rig: Rig) -> tuple[str, bool]:
+    """Kill the lag table's server, and start it again."""
+    since = rig.signal('lag_table_server', signal.SIGKILL)
+    alone = harmless_or_safe(rig, since)
+    since = time.monotonic_ns()
+    rig.start('lag_table_server')
+    return both(alone, harmless_or_safe(rig, since, 5.0))
+
+
+def killed_plant(rig: Rig) -> tuple[str, bool]:
+    """Kill the plant, and start a new run with the same controllers."""
+    since = rig.signal('plant_simulator', signal.SIGKILL)
+    rig.listen(2.0 * AFTER)
+    late = len(rig.messages('valve_command', since + round(SAFE_WITHIN * 1e9)))
+    reason = rig.reason(since, 'waiting for bundle_state')
+    words = f'{late} commands after {SAFE_WITHIN * 1e3:g} ms; "{reason}"'
+    rig.start('plant_simulator')
+    return both((words, late == 0 and bool(reason)), goes_on(rig))
+
+
+def held_up(name: str) -> Fault:
+    """Return the fault that a controller stands still for half a second."""
+
+    def hurt(rig: Rig) -> tuple[str, bool]:
+        since = rig.signal(name, signal.SIGSTOP)
+        rig.listen(STOPPED)
+        rig.signal(name, signal.SIGCONT)
+        return both(safe_and_said(rig, since, 'no answer', WAITS[name]), goes_on(rig))
+
+    return Fault(f'SIGSTOP for {STOPPED:g} s: {name}', f'{IN_TIME}; the run goes on', hurt)
+
+
+def held_up_server(rig: Rig) -> tuple[str, bool]:
+    """Let the lag table's server stand still for half a second."""
+    since = rig.signal('lag_table_server', signal.SIGSTOP)
+    rig.listen(STOPPED)
+    rig.signal('lag_table_server', signal.SIGCONT)
+    return harmless_or_safe(rig, since)
+
+
+def held_up_plant(rig: Rig) -> tuple[str, bool]:
+    """Let the plant stand still: it integrates the time it missed, vented from 20 ms on."""
+    since = rig.signal('plant_simulator', signal.SIGSTOP)
+    rig.listen(STOPPED)
+    rig.signal('plant_simulator', signal.SIGCONT)
+    rig.wait_for(lambda: rig.safe_after(since) is not None, 'the safe state', 5.0)
+    rig.listen(AFTER)
+    reason = rig.reason(since, 'held up')
+    ticks = [s.tick for s in rig.messages('bundle_state', since)]
+    gaps = sum(b - a != 1 for a, b in itertools.pairwise(ticks))
+    first = next(s for s in rig.messages('bundle_state', since) if s.safe)
+    low = first.mu_pressure[0] / rig.configuration.source.nominal_pressure
+    words = f'"{reason}"; MU1 at {low:.1%} of nominal then, {gaps} gaps in ticks'
+    return both((words, bool(reason) and gaps == 0 and low < VENTED), goes_on(rig))
+
+
+def two_supervisors(rig: Rig) -> tuple[str, bool]:
+    """Start a second supervisor; ticks tell when its first message came and the plant was safe."""
+    from fam_bundle_node.qos import REALTIME_SUBSCRIPTION
+
+    begin = time.monotonic_ns()
+    rig.watch('recruitment_state')
+    rig.start('recruitment_supervisor', alias='second_supervisor')
+    rig.wait_for(lambda: rig.safe_after(begin) is not None, 'the safe state')
+    rig.listen(AFTER)
+    counts = Counter(s.message.tick for s in rig.seen['recruitment_state'])
+    doubled = min((tick for tick, count in counts.items() if count > 1), default=None)
+    states = [s.message for s in rig.seen['bundle_state']]
+    due = {state.tick: state.steady_time for state in states}
+    if doubled is None or doubled not in due:
+        return 'the second supervisor was not seen', False
+    # It begins with the samples that it is still given, which are done with.
+    late = REALTIME_SUBSCRIPTION.depth * rig.configuration.simulation.period
+    found = safe_and_said(rig, due[doubled], 'came twice', 'asks for', backlog=late)
+    rig.signal('second_supervisor', signal.SIGKILL)
+    rig.listen(0.5)
+    return both(found, reset(rig))

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is asked of the loop after a fault: observations in words, each with a verdict."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from fam_bundle_bringup.rig import Rig
+
+SAFE_WITHIN = 0.02  # s of real time
+AFTER = 1.5  # s of watching; a report comes once a second
+VENTED = 0.05  # of the nominal pressure
+BUMP = 0.01  # of the nominal pressure, largest step when a controller sets in again
+
+
+class Fault(NamedTuple):
+    """A fault by name, what must happen, and how it is done; ``hurt`` returns observed, passed."""
+
+    name: str
+    expected: str
+    hurt: Callable[[Rig], tuple[str, bool]]
+    start: Callable[[Rig], None] = Rig.start_all
+
+
+IN_TIME = f'safe within {SAFE_WITHIN * 1e3:g} ms, reason on /diagnostics'
+HARMLESS = f'harmless, or safe while commands are {SAFE_WITHIN * 1e3:g} ms old, then goes on'
+
+
+def safe_and_said(rig: Rig, since: int, *words: str, backlog: float = 0.0) -> tuple[str, bool]:
+    """Return whether the plant was safe in time and somebody said one of ``words``.
+
+    ``backlog`` (s) is what may pass from ``since`` until the fault reaches the loop.
+    """
+    rig.wait_for(lambda: rig.safe_after(since) is not None, 'the safe state', 5.0)
+    rig.listen(AFTER)
+    took, reason = rig.safe_after(since) or 0.0, rig.reason(since, *words)
+    said = f'"{reason}"' if reason else 'no reason on /diagnostics'
+    low = rig.vented_to(since) / rig.configuration.source.nominal_pressure
+    of_which = f' (of them up to {backlog * 1e3:g} ms a backlog)' if backlog else ''
+    observed = f'safe after {took * 1e3:.1f} ms{of_which}, vented to {low:.1%} of nominal; {said}'
+    return observed, took <= SAFE_WITHIN + backlog and bool(reason) and low < VENTED
+
+
+def goes_on(rig: Rig) -> tuple[str, bool]:
+    """Return whether the loop runs again by itself, and sets in without a bump."""
+    took = rig.wait_for(rig.runs, 'the run to go on')
+    joined = rig.first_tick_of_this_stretch()
+    bump = first_bump(rig, joined)
+    nominal = rig.configuration.source.nominal_pressure
+    words = f'goes on after {took:.1f} s, first reference {bump / nominal:.2%} of nominal off'
+    return words, bump <= BUMP * nominal
+
+
+def first_bump(rig: Rig, tick: int) -> float:
+    """Return how far the first applied reference from ``tick`` on is from the pressure (Pa)."""
+    commands = (s.message for s in rig.seen['valve_command'])
+    references = {command.tick: command.pressure_reference[0] for command in commands}
+    measured = {s.message.tick: s.message.mu_pressure[0] for s in rig.seen['bundle_state']}
+    first = min((t for t in references if t >= tick and t in measured), default=None)
+    if first is None:
+        raise RuntimeError(f'no pressure reference from tick {tick} on')
+    return float(abs(references[first] - measured[first]))
+
+
+def both(*found: tuple[str, bool]) -> tuple[str, bool]:
+    """Join observations; all must pass."""
+    return '; '.join(words for words, _ in found), all(passed for _, passed in found)
+
+
+def harmless_or_safe(rig: Rig, since: int, seconds: float = AFTER) -> tuple[str, bool]:
+    """Return whether for a while nothing happened, or the plant was safe while it had to be.
+
+    A process that comes or goes costs the others time in the middleware and on the cores.
+    """
+    found, undisturbed = harmless(rig, since, seconds)
+    if undisturbed:
+        return found, True
+    stale = rig.stale_but_not_safe(since, SAFE_WITHIN)
+    return both((f'{found}; {stale} samples neither safe nor commanded', stale == 0), goes_on(rig))
+
+
+def harmless(rig: Rig, since: int, seconds: float = AFTER) -> tuple[str, bool]:
+    """Return whether for a while the plant was never safe and answered without a gap."""
+    rig.listen(seconds)
+    answered = {s.message.tick for s in rig.seen['valve_command']}
+    states = rig.messages('bundle_state', since)
+    lost = sum(s.tick not in answered for s in states[:-20])
+    safe = sum(s.safe for s in states)
+    why = f' ("{rig.reason(since, "safe", "fault")}")' if safe else ''
+    words = f'{len(states)} samples, {lost} without a command, {safe} safe{why}'
+    if rig.ended():
+        words += f', ended: {", ".join(rig.ended())}'
+    enough = len(states) > 0.8 * seconds / rig.configuration.simulation.period
+    alive = enough and rig.runs() and not rig.ended()
+    return words, alive and lost == 0 and safe == 0
+
+
+def reset(rig: Rig) -> tuple[str, bool]:
+    """Reset the latched fault, without which nothing goes on."""
+    from std_srvs.srv import Trigger
+
+    latched = not rig.runs()
+    client = rig.node.create_client(Trigger, 'plant_simulator/reset_fault')
+    rig.wait_for(client.service_is_ready, 'reset_fault')
+    future = client.call_async(Trigger.Request())
+    rig.wait_for(future.done, 'the answer of reset_fault')
+    words = f'latched: {"yes" if latched else "no"}, reset: {future.result().success}'
+    return both((words, latched and future.result().success), goes_on(rig))
