@@ -341,7 +341,9 @@ def test_run_starts_the_executable_in_the_sourced_environment(tree):
     assert variables['PYTHONPATH'] == '/ours'
     assert 'AMENT_PREFIX_PATH' not in variables
     assert variables['ROS_DOMAIN_ID'] == '7'
-    assert variables['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+    assert variables['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SYSTEM_DEFAULT'
+    profile = tree.root / 'ros2_ws/src/fam_bundle_bringup/config/fastdds_loopback.xml'
+    assert variables['FASTRTPS_DEFAULT_PROFILES_FILE'] == str(profile)
     assert variables['RMW_IMPLEMENTATION'] == 'rmw_fastrtps_cpp'
 
 

@@ -11,6 +11,7 @@ from fam_bundle_bringup.domain_marker import marked
 from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.processes import NodeDied, NodeGroup, executable
+from fam_bundle_bringup.this_machine import stay_on_this_machine
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration, write_yaml
 
@@ -40,7 +41,7 @@ def own_domain() -> Iterator[int]:
     reservation = domain_id()
     number = reservation.__enter__()
     os.environ['ROS_DOMAIN_ID'] = str(number)
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    stay_on_this_machine()
     try:
         with marked(int(number)):
             yield int(number)

@@ -114,12 +114,14 @@ def inject(rig: Rig, topic: str, damage: Damage, times: int) -> int:
     rig.wait_for(lambda: rig.seen[topic][-1].message.tick > 1000, 'ticks to replay')
     rig.wait_for(lambda: publisher.get_subscription_count() >= readers, f'readers of {topic}')
     rig.listen(0.2)
-    since = 0
+    since, sent = 0, set[int]()  # what is sent here is seen here, too
     for number in range(times):
         if number < STRIKES:
             since = time.monotonic_ns()
-        message = deepcopy(rig.seen[topic][-1].message)
+        good = (s.message for s in reversed(rig.seen[topic]) if s.message.tick not in sent)
+        message = deepcopy(next(good))
         damage(message)
+        sent.add(message.tick)
         publisher.publish(message)
         rig.listen(0.001)
     return since

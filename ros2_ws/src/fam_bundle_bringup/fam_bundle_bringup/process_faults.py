@@ -83,7 +83,7 @@ def held_up_server(rig: Rig) -> tuple[str, bool]:
 
 
 def held_up_plant(rig: Rig) -> tuple[str, bool]:
-    """Let the plant stand still: it integrates the time it missed, vented from 20 ms on."""
+    """Let the plant stand still: it integrates the time it missed, vented from the time-out on."""
     since = rig.signal('plant_simulator', signal.SIGSTOP)
     rig.listen(STOPPED)
     rig.signal('plant_simulator', signal.SIGCONT)

@@ -196,11 +196,6 @@ class Rig:
         """Return the nodes that have ended without being killed by a signal of ours."""
         return [n for n, p in self.nodes.items() if p.poll() not in (None, -signal.SIGKILL)]
 
-    def last_line(self, name: str) -> str:
-        """Return the last line that a node printed."""
-        lines = (self._folder / 'log' / f'{name}.log').read_text(errors='replace').splitlines()
-        return lines[-1].strip() if lines else ''
-
     def vented_to(self, since: int) -> float:
         """Return the lowest that the fullest motor unit came to while safe (Pa), from then on."""
         safe = [s.message for s in self.seen['bundle_state'] if s.message.safe and s.at >= since]

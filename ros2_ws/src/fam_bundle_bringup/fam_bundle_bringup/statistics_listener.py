@@ -2,11 +2,11 @@
 """Listens to the loop statistics of every node of a domain, whatever its namespace."""
 
 import contextlib
-import os
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+from fam_bundle_bringup.this_machine import stay_on_this_machine
 from fam_bundle_model.parameters import seconds
 from fam_bundle_node.stamps import nanoseconds
 
@@ -93,7 +93,7 @@ def listening(domain: int) -> Iterator[Callable[[float], list[Report]]]:
 
     from fam_bundle_node.run import make_executor
 
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+    stay_on_this_machine()
     rclpy.init(args=[], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     with contextlib.ExitStack() as stack:
         stack.callback(rclpy.try_shutdown)

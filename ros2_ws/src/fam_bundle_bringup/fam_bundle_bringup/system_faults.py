@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can go wrong around the nodes: the system's clock, the middleware's shared memory."""
 
-import contextlib
 import os
 import subprocess
 import sys
@@ -155,19 +154,9 @@ def without_shared_memory(name: str, kind: str) -> Fault:
     def start(rig: Rig) -> None:
         for other in PACKAGES:
             rig.start(other, prefix=prefix if other == name else ())
+        rig.wait_for(rig.runs, 'the loop to run')
 
     def hurt(rig: Rig) -> tuple[str, bool]:
-        begin = time.monotonic_ns()
-        with contextlib.suppress(RuntimeError):
-            rig.wait_for(rig.runs, 'the loop to run', 40.0)
-        if rig.runs():
-            return harmless(rig, time.monotonic_ns(), 5.0)
-        plant = rig.nodes['plant_simulator']
-        reason = rig.reason(begin, 'waiting for')
-        last = rig.last_line('plant_simulator')
-        words = f'never ran, plant ended with status {plant.poll()}: {last}; "{reason}"'
-        told = 'has not come within' in last or 'listeners after' in last
-        return words, plant.poll() == 1 and told and bool(reason)
+        return harmless(rig, time.monotonic_ns(), 2.0 * AFTER)
 
-    expected = 'harmless, or the plant never leaves rest and ends with a reason'
-    return Fault(f'shared memory {kind}: {name}', expected, hurt, start)
+    return Fault(f'shared memory {kind}: {name}', 'harmless', hurt, start)

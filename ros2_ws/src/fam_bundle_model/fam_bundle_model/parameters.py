@@ -217,7 +217,7 @@ class RunParameters:
         's', 'wall time without the answer to a tick that ends a lock-step run', default=20.0
     )
     command_timeout: float = positive(
-        's', 'time without commands after which a plant in real time goes safe', default=0.02
+        's', 'time without commands after which a plant in real time goes safe', default=0.015
     )
     busy_tail: float = number(
         's', 'end of each real-time wait that is spent awake', default=0.0, minimum=0.0
