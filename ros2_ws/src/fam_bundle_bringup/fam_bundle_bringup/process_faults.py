@@ -98,6 +98,13 @@ def held_up_plant(rig: Rig) -> tuple[str, bool]:
     return both((words, bool(reason) and gaps == 0 and low < VENTED), goes_on(rig))
 
 
+def doubled(rig: Rig) -> int | None:
+    """Return when the first sample was due to which two supervisors answered (ns, steady)."""
+    counts = Counter(s.message.tick for s in rig.seen['recruitment_state'])
+    states = (s.message for s in rig.seen['bundle_state'])
+    return next((s.steady_time for s in states if counts[s.tick] > 1), None)
+
+
 def two_supervisors(rig: Rig) -> tuple[str, bool]:
     """Start a second supervisor; ticks tell when its first message came and the plant was safe."""
     from fam_bundle_node.qos import REALTIME_SUBSCRIPTION
@@ -105,17 +112,12 @@ def two_supervisors(rig: Rig) -> tuple[str, bool]:
     begin = time.monotonic_ns()
     rig.watch('recruitment_state')
     rig.start('recruitment_supervisor', alias='second_supervisor')
-    rig.wait_for(lambda: rig.safe_after(begin) is not None, 'the safe state')
-    rig.listen(AFTER)
-    counts = Counter(s.message.tick for s in rig.seen['recruitment_state'])
-    doubled = min((tick for tick, count in counts.items() if count > 1), default=None)
-    states = [s.message for s in rig.seen['bundle_state']]
-    due = {state.tick: state.steady_time for state in states}
-    if doubled is None or doubled not in due:
-        return 'the second supervisor was not seen', False
+    rig.wait_for(lambda: doubled(rig) is not None, 'the second supervisor')
+    since = doubled(rig) or begin
+    rig.wait_for(lambda: rig.safe_after(since) is not None, 'the safe state')
     # It begins with the samples that it is still given, which are done with.
     late = REALTIME_SUBSCRIPTION.depth * rig.configuration.simulation.period
-    found = safe_and_said(rig, due[doubled], 'came twice', 'asks for', backlog=late)
+    found = safe_and_said(rig, since, 'came twice', 'asks for', backlog=late)
     rig.signal('second_supervisor', signal.SIGKILL)
     rig.listen(0.5)
     return both(found, reset(rig))

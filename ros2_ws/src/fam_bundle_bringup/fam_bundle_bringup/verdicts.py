@@ -4,6 +4,8 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 from fam_bundle_bringup.rig import Rig
 
 SAFE_WITHIN = 0.02  # s of real time
@@ -51,14 +53,19 @@ def goes_on(rig: Rig) -> tuple[str, bool]:
 
 
 def first_bump(rig: Rig, tick: int) -> float:
-    """Return how far the first applied reference from ``tick`` on is from the pressure (Pa)."""
+    """Return how far the first applied reference from ``tick`` on is from the pressure (Pa).
+
+    That is the pressure of its sample or of the one before, at which the law was kept until then:
+    a unit that is being vented loses some percent in a millisecond.
+    """
     commands = (s.message for s in rig.seen['valve_command'])
     references = {command.tick: command.pressure_reference[0] for command in commands}
     measured = {s.message.tick: s.message.mu_pressure[0] for s in rig.seen['bundle_state']}
     first = min((t for t in references if t >= tick and t in measured), default=None)
     if first is None:
         raise RuntimeError(f'no pressure reference from tick {tick} on')
-    return float(abs(references[first] - measured[first]))
+    ends = sorted((measured[first], measured.get(first - 1, measured[first])))
+    return float(abs(references[first] - np.clip(references[first], *ends)))
 
 
 def both(*found: tuple[str, bool]) -> tuple[str, bool]:
