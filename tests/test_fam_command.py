@@ -22,6 +22,7 @@ TOOLS = {
     'make': '',
     'cmake': 'echo cmake version 3.25.1',
 }
+PROFILE = 'ros2_ws/src/fam_bundle_bringup/config/fastdds_loopback.xml'
 LOCKS = sorted((REPOSITORY / 'requirements').glob('*.txt'))
 
 
@@ -44,6 +45,7 @@ class Tree:
         for name in (
             'fam',
             'cmake/wheel_include_dirs.cmake',
+            PROFILE,
             *(f'requirements/{p.name}' for p in LOCKS),
         ):
             target = self.root / name
@@ -342,9 +344,18 @@ def test_run_starts_the_executable_in_the_sourced_environment(tree):
     assert 'AMENT_PREFIX_PATH' not in variables
     assert variables['ROS_DOMAIN_ID'] == '7'
     assert variables['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SYSTEM_DEFAULT'
-    profile = tree.root / 'ros2_ws/src/fam_bundle_bringup/config/fastdds_loopback.xml'
-    assert variables['FASTRTPS_DEFAULT_PROFILES_FILE'] == str(profile)
+    assert variables['FASTRTPS_DEFAULT_PROFILES_FILE'] == str(tree.root / PROFILE)
     assert variables['RMW_IMPLEMENTATION'] == 'rmw_fastrtps_cpp'
+
+
+def test_nothing_starts_that_would_use_every_network(tree):
+    tree.pretend_set_up()
+    (tree.root / PROFILE).unlink()
+    for step in tree.module().plan(False, True):
+        step.stamp.write_text(step.digest)
+    status, out, err = tree.fam('run', 'some_nodes', 'some_node')
+    assert (status, out) == (2, '')
+    assert_one_line(err, PROFILE, 'is missing')
 
 
 @pytest.mark.parametrize('command', ['demo', 'experiment', 'bench', 'faults', 'top'])

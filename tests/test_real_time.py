@@ -6,6 +6,7 @@ No test here depends on how punctual the machine is; ``./fam bench`` and ``./fam
 
 import dataclasses
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -29,6 +30,7 @@ from fam_bundle_bringup.message_faults import inject, not_finite
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_bringup.processes import executable
 from fam_bundle_bringup.rig import Rig
+from fam_bundle_bringup.system_faults import shares_memory
 from fam_bundle_bringup.verdicts import first_bump
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration, write_yaml
@@ -118,6 +120,16 @@ def rig(quick: Callable[..., Configuration], tmp_path: Path) -> Iterator[Rig]:
     with Rig(configuration, tmp_path) as running:
         running.start_all()
         yield running
+
+
+def test_nothing_leaves_the_machine_or_shares_its_memory(rig: Rig) -> None:
+    for name, process in rig.nodes.items():
+        links = [os.readlink(f) for f in Path(f'/proc/{process.pid}/fd').iterdir()]
+        sockets = {link[8:-1] for link in links if link.startswith('socket:[')}
+        rows = Path(f'/proc/{process.pid}/net/udp').read_text().splitlines()[1:]
+        addresses = {row.split()[1].partition(':')[0] for row in rows if row.split()[9] in sockets}
+        assert addresses == {f'{int.from_bytes(bytes([127, 0, 0, 1]), sys.byteorder):08X}'}, name
+        assert not shares_memory(process.pid)
 
 
 @pytest.mark.parametrize('victim', ['strain_controller', 'recruitment_supervisor'])

@@ -16,7 +16,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package}']),
         (f'share/{package}', ['package.xml']),
-        (f'share/{package}/config', sorted(glob('config/*'))),
+        (f'share/{package}/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
     ],
     install_requires=['setuptools'],
     extras_require={'test': ['pytest']},

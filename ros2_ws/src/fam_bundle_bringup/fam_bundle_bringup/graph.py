@@ -37,11 +37,11 @@ def own_domain() -> Iterator[int]:
     """Reserve a DDS domain that no other run on this machine uses, and stay on the machine."""
     from domain_coordinator import domain_id
 
+    stay_on_this_machine()
     # Entered by hand: as a context it would swallow an OSError of the run.
     reservation = domain_id()
     number = reservation.__enter__()
     os.environ['ROS_DOMAIN_ID'] = str(number)
-    stay_on_this_machine()
     try:
         with marked(int(number)):
             yield int(number)

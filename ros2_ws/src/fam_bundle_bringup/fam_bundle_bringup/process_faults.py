@@ -19,6 +19,7 @@ from fam_bundle_bringup.verdicts import (
     reset,
     safe_and_said,
 )
+from fam_bundle_model.parameters import Configuration
 
 STOPPED = 0.5  # s that a node is held up
 
@@ -105,19 +106,26 @@ def doubled(rig: Rig) -> int | None:
     return next((s.steady_time for s in states if counts[s.tick] > 1), None)
 
 
-def two_supervisors(rig: Rig) -> tuple[str, bool]:
-    """Start a second supervisor; ticks tell when its first message came and the plant was safe."""
+def backlog(configuration: Configuration) -> float:
+    """Return how old (s) the samples are with which a node begins that joins a running loop.
+
+    They are done with: its answers to them come before there are two for the same newest one.
+    """
+    from fam_bundle_node.loop_node import STALE
     from fam_bundle_node.qos import REALTIME_SUBSCRIPTION
 
-    begin = time.monotonic_ns()
+    kept = REALTIME_SUBSCRIPTION.depth * configuration.simulation.period
+    return min(kept, STALE * configuration.run.command_timeout)
+
+
+def two_supervisors(rig: Rig) -> tuple[str, bool]:
+    """Start a second supervisor; ticks tell when its first message came and the plant was safe."""
     rig.watch('recruitment_state')
     rig.start('recruitment_supervisor', alias='second_supervisor')
     rig.wait_for(lambda: doubled(rig) is not None, 'the second supervisor')
-    since = doubled(rig) or begin
+    since = doubled(rig) or 0
     rig.wait_for(lambda: rig.safe_after(since) is not None, 'the safe state')
-    # It begins with the samples that it is still given, which are done with.
-    late = REALTIME_SUBSCRIPTION.depth * rig.configuration.simulation.period
-    found = safe_and_said(rig, since, 'came twice', 'asks for', backlog=late)
+    found = safe_and_said(rig, since, 'came twice', 'asks for', backlog=backlog(rig.configuration))
     rig.signal('second_supervisor', signal.SIGKILL)
     rig.listen(0.5)
     return both(found, reset(rig))

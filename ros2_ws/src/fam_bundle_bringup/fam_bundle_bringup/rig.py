@@ -177,8 +177,10 @@ class Rig:
         """Listen until ``true`` and return how long it took (s); raises RuntimeError if never."""
         begin = time.monotonic()
         while not true():
-            if time.monotonic() - begin > patience:
-                raise RuntimeError(f'waited {patience:g} s in vain for {what}')
+            if time.monotonic() - begin > patience or self.ended():
+                ended = ''.join(f'; {name} ended: {self.last_line(name)}' for name in self.ended())
+                waited = time.monotonic() - begin
+                raise RuntimeError(f'waited {waited:.0f} s in vain for {what}{ended}')
             self.listen(SLICE)
         return time.monotonic() - begin
 
@@ -196,17 +198,28 @@ class Rig:
         """Return the nodes that have ended without being killed by a signal of ours."""
         return [n for n, p in self.nodes.items() if p.poll() not in (None, -signal.SIGKILL)]
 
+    def last_line(self, name: str) -> str:
+        """Return the last line that a node printed."""
+        lines = (self._folder / 'log' / f'{name}.log').read_text(errors='replace').splitlines()
+        return lines[-1].strip() if lines else 'without a word'
+
     def vented_to(self, since: int) -> float:
         """Return the lowest that the fullest motor unit came to while safe (Pa), from then on."""
         safe = [s.message for s in self.seen['bundle_state'] if s.message.safe and s.at >= since]
         return min((max(message.mu_pressure) for message in safe), default=math.inf)
 
     def safe_after(self, since: int) -> float | None:
-        """Return how long after ``since`` (ns, steady) the first safe sample was due (s)."""
-        for sample in self.seen['bundle_state']:
-            due = sample.message.steady_time
-            if sample.message.safe and due >= since:
-                return float(due - since) * 1e-9
+        """Return how long after ``since`` (ns, steady) the first safe sample was due (s).
+
+        Raises RuntimeError when the plant was safe at that time already, for another reason.
+        """
+        before = False
+        for sample in (s.message for s in self.seen['bundle_state']):
+            if sample.safe and sample.steady_time >= since:
+                if before:
+                    raise RuntimeError('the plant was safe before the fault')
+                return float(sample.steady_time - since) * 1e-9
+            before = sample.safe and sample.steady_time < since
         return None
 
     def stale_but_not_safe(self, since: int, limit: float) -> int:

@@ -2,6 +2,7 @@
 """What can go wrong around the nodes: the system's clock, the middleware's shared memory."""
 
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -11,12 +12,16 @@ from pathlib import Path
 from fam_bundle_bringup.rig import PACKAGES, Rig
 from fam_bundle_bringup.verdicts import AFTER, Fault, both, harmless
 
-# Preloaded, it adds the seconds in a mapped file to the system clock of a process, and takes them
-# off again where a wait gives a date. libfaketime 0.9.10 will not do: with it sleeps on the steady
+COMPILERS = ('cc', 'gcc', 'clang')
+LEASE = 25.0  # s; after 20 the middleware forgets who was not heard of
+
+# Preloaded, it adds the seconds in a mapped file to the system clock of a process, and to that of
+# waits until a date. libfaketime 0.9.10 will not do: with it sleeps on the steady
 # clock fail, waits for the interpreter's lock are late, and its own lock holds the loop up.
 OWN_CLOCK = r"""
 #define _GNU_SOURCE
 #include <dlfcn.h>
+#include <errno.h>
 #include <fcntl.h>
 #include <pthread.h>
 #include <semaphore.h>
@@ -67,29 +72,52 @@ time_t time(time_t *seconds)
     return seconds ? (*seconds = now.tv_sec) : now.tv_sec;
 }
 
-static struct timespec until(instant t)
+/* A wait until a date ends when this clock gets there, also if it is stepped meanwhile: so it
+   looks again every ten milliseconds. A wait on the steady clock is as it was. */
+static int again(int result, instant t, struct timespec *slice)
 {
-    struct timespec real = *t;
-    if (real.tv_sec > 1000000000) real.tv_sec -= *offset; /* a date, not a time since the start */
-    return real;
+    struct timespec now;
+    clock_gettime(CLOCK_REALTIME, &now);
+    if (result != ETIMEDOUT || t->tv_sec < 1000000000) return 0;
+    if (now.tv_sec > t->tv_sec || (now.tv_sec == t->tv_sec && now.tv_nsec >= t->tv_nsec)) return 0;
+    get(CLOCK_REALTIME, slice);
+    slice->tv_nsec += 10000000;
+    if (slice->tv_nsec >= 1000000000) { slice->tv_sec++; slice->tv_nsec -= 1000000000; }
+    return 1;
+}
+
+static struct timespec first(instant t)
+{
+    struct timespec slice = *t;
+    again(ETIMEDOUT, t, &slice);
+    return slice;
 }
 
 int pthread_cond_timedwait(pthread_cond_t *condition, pthread_mutex_t *mutex, instant t)
 {
-    struct timespec real = until(t);
-    return cond_wait(condition, mutex, &real);
+    struct timespec slice = first(t);
+    int result;
+    do result = cond_wait(condition, mutex, &slice);
+    while (again(result, t, &slice));
+    return result;
 }
 
 int sem_timedwait(sem_t *semaphore, instant t)
 {
-    struct timespec real = until(t);
-    return sem_wait_until(semaphore, &real);
+    struct timespec slice = first(t);
+    int result;
+    do result = sem_wait_until(semaphore, &slice);
+    while (result && again(errno, t, &slice));
+    return result;
 }
 
 int pthread_mutex_timedlock(pthread_mutex_t *mutex, instant t)
 {
-    struct timespec real = until(t);
-    return mutex_lock_until(mutex, &real);
+    struct timespec slice = first(t);
+    int result;
+    do result = mutex_lock_until(mutex, &slice);
+    while (again(result, t, &slice));
+    return result;
 }
 """
 
@@ -104,7 +132,7 @@ def stepped_clock(folder: Path, seconds: int) -> Fault:
     def hurt(rig: Rig) -> tuple[str, bool]:
         since = time.monotonic_ns()
         set_offset(offset, seconds)
-        found = harmless(rig, since, 2.0 * AFTER)
+        found = harmless(rig, since, LEASE)
         jumps = {report.node: report.stamp - report.at_system for report in rig.reports}
         jumped = set(jumps) == set(PACKAGES) and all(
             abs(jump - seconds) < 1.0 for jump in jumps.values()
@@ -129,27 +157,28 @@ def with_own_clock(offset: Path, folder: Path) -> Mapping[str, str]:
     """
     set_offset(offset, 0)
     library = (folder / 'own_clock.so').resolve()
-    command = ['cc', '-shared', '-fPIC', '-x', 'c', '-o', str(library), '-', '-ldl']
+    named = os.environ.get('CC', '').split()[:1]
+    compiler = next(filter(shutil.which, (*named, *COMPILERS)), 'cc')
+    command = [compiler, '-shared', '-fPIC', '-x', 'c', '-o', str(library), '-', '-ldl']
     try:
         subprocess.run(command, input=OWN_CLOCK, text=True, check=True, capture_output=True)
-    except (OSError, subprocess.CalledProcessError) as error:
-        raise RuntimeError(f'not tried: the C compiler cc is needed: {error}') from None
+    except OSError as error:
+        raise RuntimeError(f'not tried: the C compiler {compiler}: {error.strerror}') from None
+    except subprocess.CalledProcessError as error:
+        last = error.stderr.strip().splitlines()[-1:]
+        raise RuntimeError(f'not tried: {compiler}: {"".join(last)}') from None
     return {'LD_PRELOAD': str(library), 'CLOCK_OFFSET': str(offset.resolve())}
 
 
-# Both take shared memory from one process only, in a mount namespace of its own.
-WITHOUT_SHARED_MEMORY = {
-    'read-only': 'mount -o remount,bind,ro /dev/shm',
-    'of its own': 'mount -t tmpfs tmpfs /dev/shm',
-}
+def without_shared_memory(name: str) -> Fault:
+    """Return the fault that one node has shared memory of its own, in a mount namespace.
 
-
-def without_shared_memory(name: str, kind: str) -> Fault:
-    """Return the fault that one node cannot use the shared memory of the others."""
-    mount = f'mount --bind /dev/shm /dev/shm && {WITHOUT_SHARED_MEMORY[kind]} && exec "$@"'
+    Nothing uses any: that is asked of all nodes, for a process that is killed while it holds a
+    lock there holds the others up.
+    """
     user = () if os.geteuid() == 0 else ('--user', '--map-root-user')
     namespace = ('unshare', *user, '--mount', '--propagation', 'private')
-    prefix = (*namespace, 'sh', '-c', mount, 'sh')
+    prefix = (*namespace, 'sh', '-c', 'mount -t tmpfs tmpfs /dev/shm && exec "$@"', 'sh')
 
     def start(rig: Rig) -> None:
         for other in PACKAGES:
@@ -157,6 +186,13 @@ def without_shared_memory(name: str, kind: str) -> Fault:
         rig.wait_for(rig.runs, 'the loop to run')
 
     def hurt(rig: Rig) -> tuple[str, bool]:
-        return harmless(rig, time.monotonic_ns(), 2.0 * AFTER)
+        sharing = [n for n, process in rig.nodes.items() if shares_memory(process.pid)]
+        words = f'shared memory of the middleware in: {", ".join(sharing) or "no node"}'
+        return both(harmless(rig, time.monotonic_ns(), 2.0 * AFTER), (words, not sharing))
 
-    return Fault(f'shared memory {kind}: {name}', 'harmless', hurt, start)
+    return Fault(f'shared memory of its own: {name}', 'harmless, for none is used', hurt, start)
+
+
+def shares_memory(process: int) -> bool:
+    """Return whether Fast DDS has mapped shared memory in a process."""
+    return '/dev/shm/fastrtps' in Path(f'/proc/{process}/maps').read_text()

@@ -44,11 +44,11 @@ def safe_and_said(rig: Rig, since: int, *words: str, backlog: float = 0.0) -> tu
 
 def goes_on(rig: Rig) -> tuple[str, bool]:
     """Return whether the loop runs again by itself, and sets in without a bump."""
-    took = rig.wait_for(rig.runs, 'the run to go on')
+    rig.wait_for(rig.runs, 'the run to go on')
     joined = rig.first_tick_of_this_stretch()
     bump = first_bump(rig, joined)
     nominal = rig.configuration.source.nominal_pressure
-    words = f'goes on after {took:.1f} s, first reference {bump / nominal:.2%} of nominal off'
+    words = f'goes on, first reference {bump / nominal:.2%} of nominal off'
     return words, bump <= BUMP * nominal
 
 
@@ -82,7 +82,8 @@ def harmless_or_safe(rig: Rig, since: int, seconds: float = AFTER) -> tuple[str,
     if undisturbed:
         return found, True
     stale = rig.stale_but_not_safe(since, SAFE_WITHIN)
-    return both((f'{found}; {stale} samples neither safe nor commanded', stale == 0), goes_on(rig))
+    words = f'{found}; {stale} samples neither safe nor commanded'
+    return both((words, stale == 0 and not rig.ended()), goes_on(rig))
 
 
 def harmless(rig: Rig, since: int, seconds: float = AFTER) -> tuple[str, bool]:

@@ -20,7 +20,8 @@ def _reliable(depth: int, durability: DurabilityPolicy) -> QoSProfile:
 # answer, so that no order of start-up can stall the loop.
 LOOP_PUBLISHER = _reliable(WRITER_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
 LOOP_SUBSCRIPTION = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
-# On a clock the next tick does not wait for the last one's reader: room for a tenth of a second.
+# On a clock the next tick does not wait for the last one's reader: room for a tenth of a second,
+# though what is older than five command time-outs is not answered.
 REALTIME_SUBSCRIPTION = _reliable(100, DurabilityPolicy.TRANSIENT_LOCAL)
 RECORDER_SUBSCRIPTION = _reliable(5 * WRITER_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
 REPORTS = _reliable(10, DurabilityPolicy.VOLATILE)

@@ -14,6 +14,7 @@ from fam_bundle_node.loop_node import LoopNode
 from fam_bundle_node.tuning import tune
 
 INTERRUPTED = 130
+CUT_SHORT = 'Unable to convert call argument'  # of the events executor
 
 
 def make_executor(kind: str = 'events') -> Executor:
@@ -58,8 +59,10 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
         spin(nodes, done)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except RuntimeError:  # of rcl or of the executor's C++
-        if rclpy.ok():  # else a callback was under way when a signal ended the context
+    except RuntimeError as error:
+        # A callback was under way when a signal ended the context: rcl and the executor say so.
+        known = isinstance(error, rclpy_implementation.RCLError) or CUT_SHORT in str(error)
+        if rclpy.ok() or not known:
             raise
     for node in nodes:
         node.close()
