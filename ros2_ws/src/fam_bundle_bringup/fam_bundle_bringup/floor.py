@@ -272,10 +272,11 @@ class BareNode:
             self._listen(topic, collect)
 
     def _publisher(self, topic: str) -> Any:
-        from fam_bundle_node.qos import LOOP_PUBLISHER
+        from fam_bundle_node.qos import LOOP_PUBLISHER, REALTIME_PUBLISHER
 
         message_type = type(loop_message(topic, self._units))
-        return self._node.create_publisher(message_type, topic, LOOP_PUBLISHER)
+        quality = REALTIME_PUBLISHER if self._period else LOOP_PUBLISHER
+        return self._node.create_publisher(message_type, topic, quality)
 
     def _listen(self, topic: str, callback: Callable[[Any], None]) -> None:
         from fam_bundle_node.qos import LOOP_SUBSCRIPTION, REALTIME_SUBSCRIPTION

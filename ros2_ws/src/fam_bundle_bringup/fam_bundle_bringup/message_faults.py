@@ -8,10 +8,11 @@ from typing import Any
 from fam_bundle_bringup.rig import Rig
 from fam_bundle_bringup.verdicts import (
     AFTER,
+    HARMLESS,
     IN_TIME,
     Fault,
     both,
-    harmless,
+    harmless_or_safe,
     reset,
     safe_and_said,
 )
@@ -81,13 +82,13 @@ def injected(topic: str, kind: str, times: int) -> Fault:
         counted = rig.counted(consumer(topic), names) - before
         number = f'{times} sent, {counted} counted by {consumer(topic)}'
         if times == 1:
-            return both((number, counted >= 1), harmless(rig, since, 0.5))
-        if rig.safe_after(since) is None:
-            return both((number, counted >= times), harmless(rig, since, 0.5))
+            return both((number, counted >= 1), harmless_or_safe(rig, since, 0.5))
         reason = topic if topic != 'valve_command' else 'fault'
+        if not rig.reason(since, reason):
+            return both((number, counted >= times), harmless_or_safe(rig, since, 0.5))
         return both((number, True), safe_and_said(rig, since, reason), reset(rig))
 
-    expected = 'counted and harmless' if times == 1 else f'harmless, or {IN_TIME} and latched'
+    expected = f'counted; {HARMLESS}' if times == 1 else f'{HARMLESS}, or {IN_TIME} and latched'
     how = 'one' if times == 1 else f'{times} in a row'
     return Fault(f'{kind} on {topic}, {how}', expected, hurt)
 

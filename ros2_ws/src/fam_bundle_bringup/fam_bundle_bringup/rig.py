@@ -209,18 +209,16 @@ class Rig:
         return min((max(message.mu_pressure) for message in safe), default=math.inf)
 
     def safe_after(self, since: int) -> float | None:
-        """Return how long after ``since`` (ns, steady) the first safe sample was due (s).
-
-        Raises RuntimeError when the plant was safe at that time already, for another reason.
-        """
-        before = False
+        """Return how long after ``since`` (ns, steady) the first safe sample was due (s)."""
         for sample in (s.message for s in self.seen['bundle_state']):
             if sample.safe and sample.steady_time >= since:
-                if before:
-                    raise RuntimeError('the plant was safe before the fault')
                 return float(sample.steady_time - since) * 1e-9
-            before = sample.safe and sample.steady_time < since
         return None
+
+    def was_safe_at(self, since: int) -> bool:
+        """Return whether the last sample due before ``since`` (ns, steady) was safe."""
+        states = (s.message for s in reversed(self.seen['bundle_state']))
+        return next((bool(s.safe) for s in states if s.steady_time < since), False)
 
     def stale_but_not_safe(self, since: int, limit: float) -> int:
         """Return how many samples from ``since`` on (ns, steady) drove the valves on old commands.

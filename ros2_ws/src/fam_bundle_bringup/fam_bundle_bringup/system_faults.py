@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from fam_bundle_bringup.rig import PACKAGES, Rig
-from fam_bundle_bringup.verdicts import AFTER, Fault, both, harmless
+from fam_bundle_bringup.verdicts import AFTER, HARMLESS, Fault, both, harmless_or_safe
 
 COMPILERS = ('cc', 'gcc', 'clang')
 LEASE = 25.0  # s; after 20 the middleware forgets who was not heard of
@@ -132,7 +132,7 @@ def stepped_clock(folder: Path, seconds: int) -> Fault:
     def hurt(rig: Rig) -> tuple[str, bool]:
         since = time.monotonic_ns()
         set_offset(offset, seconds)
-        found = harmless(rig, since, LEASE)
+        found = harmless_or_safe(rig, since, LEASE)
         jumps = {report.node: report.stamp - report.at_system for report in rig.reports}
         jumped = set(jumps) == set(PACKAGES) and all(
             abs(jump - seconds) < 1.0 for jump in jumps.values()
@@ -141,7 +141,7 @@ def stepped_clock(folder: Path, seconds: int) -> Fault:
         words = f'{len(jumps)} clocks jumped, the least by {least:.0f} s'
         return both(found, (words, jumped))
 
-    return Fault(f'system clock steps by {seconds:+d} s', 'harmless', hurt, start)
+    return Fault(f'system clock steps by {seconds:+d} s', HARMLESS, hurt, start)
 
 
 def set_offset(offset: Path, seconds: int) -> None:
@@ -188,9 +188,10 @@ def without_shared_memory(name: str) -> Fault:
     def hurt(rig: Rig) -> tuple[str, bool]:
         sharing = [n for n, process in rig.nodes.items() if shares_memory(process.pid)]
         words = f'shared memory of the middleware in: {", ".join(sharing) or "no node"}'
-        return both(harmless(rig, time.monotonic_ns(), 2.0 * AFTER), (words, not sharing))
+        found = harmless_or_safe(rig, time.monotonic_ns(), 2.0 * AFTER)
+        return both(found, (words, not sharing))
 
-    return Fault(f'shared memory of its own: {name}', 'harmless, for none is used', hurt, start)
+    return Fault(f'shared memory of its own: {name}', f'none is used; {HARMLESS}', hurt, start)
 
 
 def shares_memory(process: int) -> bool:

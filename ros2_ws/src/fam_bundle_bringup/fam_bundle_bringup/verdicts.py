@@ -38,6 +38,7 @@ def safe_and_said(rig: Rig, since: int, *words: str, backlog: float = 0.0) -> tu
     said = f'"{reason}"' if reason else 'no reason on /diagnostics'
     low = rig.vented_to(since) / rig.configuration.source.nominal_pressure
     of_which = f' (of them up to {backlog * 1e3:g} ms a backlog)' if backlog else ''
+    of_which += ' (it was before)' if rig.was_safe_at(since) else ''
     observed = f'safe after {took * 1e3:.1f} ms{of_which}, vented to {low:.1%} of nominal; {said}'
     return observed, took <= SAFE_WITHIN + backlog and bool(reason) and low < VENTED
 
@@ -83,7 +84,9 @@ def harmless_or_safe(rig: Rig, since: int, seconds: float = AFTER) -> tuple[str,
         return found, True
     stale = rig.stale_but_not_safe(since, SAFE_WITHIN)
     words = f'{found}; {stale} samples neither safe nor commanded'
-    return both((words, stale == 0 and not rig.ended()), goes_on(rig))
+    safe = any(state.safe for state in rig.messages('bundle_state', since))
+    said = not safe or bool(rig.reason(since, 'safe'))
+    return both((words, stale == 0 and said and not rig.ended()), goes_on(rig))
 
 
 def harmless(rig: Rig, since: int, seconds: float = AFTER) -> tuple[str, bool]:

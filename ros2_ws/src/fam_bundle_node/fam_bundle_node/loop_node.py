@@ -17,7 +17,12 @@ from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.checks import CHECKS
 from fam_bundle_node.declare import declare_configuration
 from fam_bundle_node.loop_meter import LoopMeter
-from fam_bundle_node.qos import LOOP_PUBLISHER, LOOP_SUBSCRIPTION, REALTIME_SUBSCRIPTION
+from fam_bundle_node.qos import (
+    LOOP_PUBLISHER,
+    LOOP_SUBSCRIPTION,
+    REALTIME_PUBLISHER,
+    REALTIME_SUBSCRIPTION,
+)
 from fam_bundle_node.stamps import StampClock
 from fam_bundle_node.statistics_publisher import StatisticsPublisher
 from fam_bundle_node.ticks import Strikes, TickCounts, TickError, TickFilter, TickOrder
@@ -70,7 +75,8 @@ class LoopNode(Node):
 
     def loop_publisher(self, message_type: type, topic: str) -> Publisher:
         """Return a publisher for a topic of the loop."""
-        return self.create_publisher(message_type, topic, LOOP_PUBLISHER)
+        quality = REALTIME_PUBLISHER if self.realtime else LOOP_PUBLISHER
+        return self.create_publisher(message_type, topic, quality)
 
     def loop_subscription(
         self, message_type: type, topic: str, callback: Callable[[Any], None]

@@ -21,8 +21,10 @@ def _reliable(depth: int, durability: DurabilityPolicy) -> QoSProfile:
 LOOP_PUBLISHER = _reliable(WRITER_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
 LOOP_SUBSCRIPTION = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
 # On a clock the next tick does not wait for the last one's reader: room for a tenth of a second,
-# though what is older than five command time-outs is not answered.
-REALTIME_SUBSCRIPTION = _reliable(100, DurabilityPolicy.TRANSIENT_LOCAL)
+# though what is older than five command time-outs is not answered. No more in the writer either:
+# whoever joins a running loop is sent all of it at once, and 2000 samples hold the loop up.
+REALTIME_PUBLISHER = _reliable(100, DurabilityPolicy.TRANSIENT_LOCAL)
+REALTIME_SUBSCRIPTION = REALTIME_PUBLISHER
 RECORDER_SUBSCRIPTION = _reliable(5 * WRITER_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
 REPORTS = _reliable(10, DurabilityPolicy.VOLATILE)
 LATCHED = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
