@@ -25,7 +25,7 @@ from fam_bundle_bringup.system_faults import (
     stepped_clock,
     without_shared_memory,
 )
-from fam_bundle_bringup.verdicts import HARMLESS, IN_TIME, SAFE_WITHIN, Fault
+from fam_bundle_bringup.verdicts import HARMLESS, SAFE_WITHIN, Fault
 from fam_bundle_model.parameters import Configuration
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.checks import CHECKS
@@ -60,7 +60,7 @@ def all_faults(folder: Path) -> Iterator[Fault]:
         'vented from the time-out on (its own time), reason on /diagnostics; goes on',
         held_up_plant,
     )
-    expected = f'{IN_TIME}, latched; the second begins with the samples that it is still given'
+    expected = 'safe as soon as both are heard, reason on /diagnostics, latched'
     yield Fault('two supervisors at once', expected, two_supervisors)
     for topic in CHECKS:
         for kind in DAMAGES:

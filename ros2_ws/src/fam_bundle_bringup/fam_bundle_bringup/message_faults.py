@@ -115,14 +115,23 @@ def inject(rig: Rig, topic: str, damage: Damage, times: int) -> int:
     rig.wait_for(lambda: rig.seen[topic][-1].message.tick > 1000, 'ticks to replay')
     rig.wait_for(lambda: publisher.get_subscription_count() >= readers, f'readers of {topic}')
     rig.listen(0.2)
-    since, sent = 0, set[int]()  # what is sent here is seen here, too
+    since, base = 0, -1
+    sent: set[int] = set()  # what is sent here is seen here, too
     for number in range(times):
+        while (good := newest_but(rig, topic, sent)).tick == base:
+            rig.listen(0.001)
+        base = good.tick
         if number < STRIKES:
             since = time.monotonic_ns()
-        good = (s.message for s in reversed(rig.seen[topic]) if s.message.tick not in sent)
-        message = deepcopy(next(good))
+        message = deepcopy(good)
         damage(message)
-        sent.add(message.tick)
         publisher.publish(message)
+        sent.add(message.tick)
         rig.listen(0.001)
     return since
+
+
+def newest_but(rig: Rig, topic: str, ticks: set[int]) -> Any:
+    """Return the newest message whose tick is none of ``ticks``."""
+    seen = reversed(rig.seen[topic])
+    return next(s.message for s in seen if s.message.tick not in ticks)

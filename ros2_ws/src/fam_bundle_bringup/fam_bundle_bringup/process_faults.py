@@ -4,7 +4,6 @@
 import itertools
 import signal
 import time
-from collections import Counter
 
 from fam_bundle_bringup.rig import Rig
 from fam_bundle_bringup.verdicts import (
@@ -19,7 +18,6 @@ from fam_bundle_bringup.verdicts import (
     reset,
     safe_and_said,
 )
-from fam_bundle_model.parameters import Configuration
 
 STOPPED = 0.5  # s that a node is held up
 
@@ -100,32 +98,27 @@ def held_up_plant(rig: Rig) -> tuple[str, bool]:
 
 
 def doubled(rig: Rig) -> int | None:
-    """Return when the first sample was due to which two supervisors answered (ns, steady)."""
-    counts = Counter(s.message.tick for s in rig.seen['recruitment_state'])
-    states = (s.message for s in rig.seen['bundle_state'])
-    return next((s.steady_time for s in states if counts[s.tick] > 1), None)
-
-
-def backlog(configuration: Configuration) -> float:
-    """Return how old (s) the samples are with which a node begins that joins a running loop.
-
-    They are done with: its answers to them come before there are two for the same newest one.
-    """
-    from fam_bundle_node.loop_node import STALE
-    from fam_bundle_node.qos import REALTIME_SUBSCRIPTION
-
-    kept = REALTIME_SUBSCRIPTION.depth * configuration.simulation.period
-    return min(kept, STALE * configuration.run.command_timeout)
+    """Return when the second answer to one sample came from a supervisor (ns, steady)."""
+    ticks = set()
+    for seen in rig.seen['recruitment_state']:
+        if seen.message.tick in ticks:
+            return seen.at
+        ticks.add(seen.message.tick)
+    return None
 
 
 def two_supervisors(rig: Rig) -> tuple[str, bool]:
-    """Start a second supervisor; ticks tell when its first message came and the plant was safe."""
+    """Start a second supervisor; until the pressure controller hears it, there is only one."""
     rig.watch('recruitment_state')
     rig.start('recruitment_supervisor', alias='second_supervisor')
     rig.wait_for(lambda: doubled(rig) is not None, 'the second supervisor')
     since = doubled(rig) or 0
-    rig.wait_for(lambda: rig.safe_after(since) is not None, 'the safe state')
-    found = safe_and_said(rig, since, 'came twice', 'asks for', backlog=backlog(rig.configuration))
+    rig.wait_for(lambda: bool(rig.reason(since, 'asks for')), 'the fault')
+    rig.listen(AFTER)
+    reason = rig.reason(since, 'came twice', 'asks for')
+    low = rig.vented_to(since) / rig.configuration.source.nominal_pressure
+    stale = rig.stale_but_not_safe(since, SAFE_WITHIN)
+    found = f'"{reason}", vented to {low:.1%} of nominal, {stale} samples on an old command'
     rig.signal('second_supervisor', signal.SIGKILL)
     rig.listen(0.5)
-    return both(found, reset(rig))
+    return both((found, low < VENTED and stale == 0), reset(rig))

@@ -137,8 +137,8 @@ def stepped_clock(folder: Path, seconds: int) -> Fault:
         jumped = set(jumps) == set(PACKAGES) and all(
             abs(jump - seconds) < 1.0 for jump in jumps.values()
         )
-        least = min(jumps.values(), key=abs)
-        words = f'{len(jumps)} clocks jumped, the least by {least:.0f} s'
+        least = min(jumps, key=lambda node: abs(jumps[node]))
+        words = f'{len(jumps)} clocks, the least jump by {jumps[least]:.0f} s in {least}'
         return both(found, (words, jumped))
 
     return Fault(f'system clock steps by {seconds:+d} s', HARMLESS, hurt, start)

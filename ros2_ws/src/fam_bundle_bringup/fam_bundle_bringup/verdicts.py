@@ -4,8 +4,6 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
-
 from fam_bundle_bringup.rig import Rig
 
 SAFE_WITHIN = 0.02  # s of real time
@@ -27,20 +25,16 @@ IN_TIME = f'safe within {SAFE_WITHIN * 1e3:g} ms, reason on /diagnostics'
 HARMLESS = f'harmless, or safe while commands are {SAFE_WITHIN * 1e3:g} ms old, then goes on'
 
 
-def safe_and_said(rig: Rig, since: int, *words: str, backlog: float = 0.0) -> tuple[str, bool]:
-    """Return whether the plant was safe in time and somebody said one of ``words``.
-
-    ``backlog`` (s) is what may pass from ``since`` until the fault reaches the loop.
-    """
+def safe_and_said(rig: Rig, since: int, *words: str) -> tuple[str, bool]:
+    """Return whether the plant was safe in time and somebody said one of ``words``."""
     rig.wait_for(lambda: rig.safe_after(since) is not None, 'the safe state', 5.0)
     rig.listen(AFTER)
     took, reason = rig.safe_after(since) or 0.0, rig.reason(since, *words)
     said = f'"{reason}"' if reason else 'no reason on /diagnostics'
     low = rig.vented_to(since) / rig.configuration.source.nominal_pressure
-    of_which = f' (of them up to {backlog * 1e3:g} ms a backlog)' if backlog else ''
-    of_which += ' (it was before)' if rig.was_safe_at(since) else ''
-    observed = f'safe after {took * 1e3:.1f} ms{of_which}, vented to {low:.1%} of nominal; {said}'
-    return observed, took <= SAFE_WITHIN + backlog and bool(reason) and low < VENTED
+    before = ' (it was before)' if rig.was_safe_at(since) else ''
+    observed = f'safe after {took * 1e3:.1f} ms{before}, vented to {low:.1%} of nominal; {said}'
+    return observed, took <= SAFE_WITHIN and bool(reason) and low < VENTED
 
 
 def goes_on(rig: Rig) -> tuple[str, bool]:
@@ -57,16 +51,20 @@ def first_bump(rig: Rig, tick: int) -> float:
     """Return how far the first applied reference from ``tick`` on is from the pressure (Pa).
 
     That is the pressure of its sample or of the one before, at which the law was kept until then:
-    a unit that is being vented loses some percent in a millisecond.
+    a unit that is being vented loses some percent in a millisecond. The law's proportional action
+    on what the strain has moved since is no bump.
     """
     commands = (s.message for s in rig.seen['valve_command'])
     references = {command.tick: command.pressure_reference[0] for command in commands}
-    measured = {s.message.tick: s.message.mu_pressure[0] for s in rig.seen['bundle_state']}
-    first = min((t for t in references if t >= tick and t in measured), default=None)
+    states = {s.message.tick: s.message for s in rig.seen['bundle_state']}
+    first = min((t for t in references if t >= tick and t in states), default=None)
     if first is None:
         raise RuntimeError(f'no pressure reference from tick {tick} on')
-    ends = sorted((measured[first], measured.get(first - 1, measured[first])))
-    return float(abs(references[first] - np.clip(references[first], *ends)))
+    now, before = states[first], states.get(first - 1, states[first])
+    gain = rig.configuration.strain_loop.proportional_gain
+    moved = gain * abs(now.strain - before.strain)
+    low, high = sorted((now.mu_pressure[0], before.mu_pressure[0]))
+    return float(max(low - moved - references[first], references[first] - high - moved, 0.0))
 
 
 def both(*found: tuple[str, bool]) -> tuple[str, bool]:

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -25,6 +24,7 @@ from fam_bundle_node.qos import (
 )
 from fam_bundle_node.stamps import StampClock
 from fam_bundle_node.statistics_publisher import StatisticsPublisher
+from fam_bundle_node.steady_timer import SteadyTimer
 from fam_bundle_node.ticks import Strikes, TickCounts, TickError, TickFilter, TickOrder
 
 RCLError = rclpy_implementation.RCLError
@@ -62,16 +62,12 @@ class LoopNode(Node):
         self.realtime = self.configuration.run.pace == 'realtime'
         self.statistics = StatisticsPublisher(self, self.meter)
         self._shown, self._reported_at = 'running', time.monotonic()
-        self.create_steady_timer(LOOK_PERIOD, self.look_after)
+        self._look = SteadyTimer(self, LOOK_PERIOD, self.look_after, self.fail_on)
 
     @property
     def counts(self) -> TickCounts:
         """What went wrong with the messages of this node."""
         return self.meter.counts
-
-    def create_steady_timer(self, period: float, callback: Callable[[], None]) -> Any:
-        """Return a timer that no step of the system clock can hold up; ``period`` in s."""
-        return self.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def loop_publisher(self, message_type: type, topic: str) -> Publisher:
         """Return a publisher for a topic of the loop."""
@@ -197,8 +193,14 @@ class LoopNode(Node):
             self.get_logger().fatal(message)
             self.done.set_result(1)
 
+    def fail_on(self, error: Exception) -> None:
+        """End the node after an error that nobody expected."""
+        if self.context.ok():  # else a signal has ended the context meanwhile
+            self.fail(f'{type(error).__name__}: {error}')
+
     def close(self) -> None:
         """End what the node does beside its callbacks."""
+        self._look.cancel()
 
 
 class Controller(LoopNode):

@@ -17,6 +17,7 @@ from fam_bundle_node.command_watch import CommandWatch
 from fam_bundle_node.loop_node import LoopNode
 from fam_bundle_node.pacing import Lockstep, Pacing, Periodic
 from fam_bundle_node.run import run_node
+from fam_bundle_node.steady_timer import SteadyTimer
 from fam_bundle_node.ticks import TickError
 from fam_bundle_sim.plant import plant, plant_step, resting_state, truth
 from fam_bundle_sim.sensors import measure, noise_samples, sensors
@@ -80,7 +81,7 @@ class PlantSimulator(LoopNode):
         self.loop_subscription(ValveCommand, 'valve_command', self.on_valve_command)
         self.create_service(Trigger, '~/reset_fault', self.on_reset_fault)
         self.compile_plant()
-        self.starter = self.create_steady_timer(MATCHING_PERIOD, self.start)
+        self.starter = SteadyTimer(self, MATCHING_PERIOD, self.start, self.fail_on)
 
     def compile_plant(self) -> None:
         """Compile what each tick calls, on copies of what it changes."""
@@ -251,7 +252,9 @@ class PlantSimulator(LoopNode):
         self.plant_step(self.rig, state, spool, seconds(self.period_ns), substeps)
 
     def close(self) -> None:
-        """End the pacing's thread."""
+        """End the threads of pacing and timers."""
+        super().close()
+        self.starter.cancel()
         self.pacing.stop()
 
 

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A timer that no step of the system clock can hold up."""
+
+import threading
+from collections.abc import Callable
+
+from rclpy.node import Node
+
+
+class SteadyTimer:
+    """Calls back in the executor of a node, woken by a thread of its own.
+
+    The executor's own timers wait on the system clock where it was built with an old C library,
+    whatever clock they are of: one that is set back by an hour silences them for that hour.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        period: float,
+        callback: Callable[[], None],
+        failed: Callable[[Exception], None],
+    ) -> None:
+        """Call ``callback`` every ``period`` s while the node has an executor.
+
+        ``failed`` gets what it raises, which the executor would keep to itself.
+        """
+        self._node, self._period = node, period
+        self._callback, self._failed = callback, failed
+        self._ended, self._called = threading.Event(), threading.Event()
+        self._called.set()
+        threading.Thread(target=self._run, name='timer', daemon=True).start()
+
+    def _run(self) -> None:
+        while not self._ended.wait(self._period):
+            executor = self._node.executor
+            if executor is not None and self._called.is_set():
+                self._called.clear()
+                executor.create_task(self._call)
+
+    def _call(self) -> None:
+        self._called.set()
+        if self._ended.is_set():  # after it was woken
+            return
+        try:
+            self._callback()
+        except Exception as error:
+            self.cancel()
+            self._failed(error)
+
+    def cancel(self) -> None:
+        """Call no more."""
+        self._ended.set()
