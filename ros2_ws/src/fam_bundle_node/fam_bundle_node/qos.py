@@ -24,7 +24,7 @@ LOOP_SUBSCRIPTION = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
 # though what is older than five command time-outs is not answered. No more in the writer either:
 # whoever joins a running loop is sent all of it at once, and 2000 samples hold the loop up.
 REALTIME_PUBLISHER = _reliable(100, DurabilityPolicy.TRANSIENT_LOCAL)
-REALTIME_SUBSCRIPTION = REALTIME_PUBLISHER
+REALTIME_SUBSCRIPTION = _reliable(100, DurabilityPolicy.TRANSIENT_LOCAL)
 RECORDER_SUBSCRIPTION = _reliable(5 * WRITER_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
 REPORTS = _reliable(10, DurabilityPolicy.VOLATILE)
 LATCHED = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
