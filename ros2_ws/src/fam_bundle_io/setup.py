@@ -19,4 +19,7 @@ setup(
     install_requires=['setuptools'],
     extras_require={'test': ['pytest']},
     zip_safe=False,
+    entry_points={
+        'console_scripts': ['bag_recorder = fam_bundle_io.bag_recorder_node:main'],
+    },
 )

@@ -94,6 +94,9 @@ def _add_experiment(commands: Any) -> None:
     experiment.add_argument(
         '--composed', action='store_true', help='all nodes of the graph in one process'
     )
+    experiment.add_argument(
+        '--record', action='store_true', help='record all topics to DIR/bag (rosbag2, MCAP)'
+    )
     experiment.add_argument('--reference', metavar='sine', help='waveform of the strain reference')
     experiment.add_argument('--amplitude', metavar='STRAIN', help='half of its peak strain')
     experiment.add_argument('--frequency', metavar='HZ', help='its frequency')
@@ -166,7 +169,12 @@ def run_experiment_command(options: argparse.Namespace, configuration: Configura
     pace = options.pace or configuration.run.pace
     with progress_bar(f'{scheme}, {pace}', configuration.ticks()) as progress:
         result = run_experiment(
-            configuration, pace, options.out, progress, composed=options.composed
+            configuration,
+            pace,
+            options.out,
+            progress,
+            composed=options.composed,
+            record=options.record,
         )
     metrics = result.metrics
     window = f'{metrics["metrics_from"]:g} to {metrics["metrics_to"]:g} s'
@@ -226,6 +234,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         changes = changes_of(options) if options.command == 'experiment' else {}
         if options.command == 'experiment' and options.composed and options.pace == 'offline':
             raise ConfigurationError('--composed: --pace offline has no nodes to compose')
+        if options.command == 'experiment' and options.record:
+            if options.pace == 'offline':
+                raise ConfigurationError('--record: --pace offline has no topics to record')
+            if (options.out / 'bag').exists():
+                raise ConfigurationError(f'--record: {options.out}/bag exists: name another --out')
         config = options.config or default_configuration()
         configuration = checked_configuration(config, changes)
         if config.resolve() == (options.out / 'parameters.yaml').resolve():

@@ -137,9 +137,11 @@ def run_experiment(
     progress: Callable[[int], None] | None = None,
     *,
     composed: bool = False,
+    record: bool = False,
 ) -> Result:
     """Run ``configuration`` and write its parameters, trace and metrics to ``folder``.
 
+    With ``record`` all topics go to the bag ``folder / 'bag'``, which must not exist.
     Raises ConfigurationError when ``folder`` cannot be written, and RunFailed when the run
     ends early; the trace of the ticks until then is kept.
     """
@@ -151,7 +153,7 @@ def run_experiment(
         else:
             run = dataclasses.replace(configuration.run, pace=pace)
             paced = dataclasses.replace(configuration, run=run)
-            trace = run_graph(paced, folder, progress, composed=composed)
+            trace = run_graph(paced, folder, progress, composed=composed, record=record)
     except RunFailed as error:
         save_trace(error.trace, folder / 'trace.npz')
         raise

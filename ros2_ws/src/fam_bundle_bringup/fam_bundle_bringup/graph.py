@@ -3,6 +3,8 @@
 
 import contextlib
 import os
+import signal
+import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,6 +31,7 @@ COMPOSED = ('fam_bundle_bringup', 'composed_loop')
 OWNERS = ('plant_simulator', 'composed_loop')  # hold the plant, whose end is the run's
 LOOP_LISTENERS = 3  # strain controller, supervisor, pressure controller
 SLICE = 0.05  # s of listening between two looks at the processes
+BAG_TIMEOUT = 20.0  # s that the bag recorder gets to write what it has
 DRAIN_TIMEOUT = 2.0  # s without a command, after the plant has ended
 
 
@@ -78,10 +81,12 @@ def run_graph(
     progress: Callable[[int], None] | None = None,
     *,
     composed: bool = False,
+    record: bool = False,
 ) -> Trace:
     """Run ``configuration`` through the graph and return its trace.
 
-    The nodes' parameter file, what they print and their loop statistics go to ``folder``.
+    The nodes' parameter file, what they print and their loop statistics go to ``folder``, and to
+    ``folder / 'bag'`` all topics if they are to be recorded.
     ``progress`` is called with the ticks done so far. Raises RunFailed when a node ends early or
     messages stay missing; in real time, where samples may be skipped, when none came through.
     """
@@ -90,13 +95,17 @@ def run_graph(
     failure = None
     with own_domain(), recording() as ((recorder,), listen):
         with nodes_in(folder) as group:
-            owner = start_nodes(group, parameter_file, LOOP_LISTENERS + 1, composed=composed)
+            bag = start_bag_recorder(group, parameter_file, folder / 'bag') if record else None
+            listeners = LOOP_LISTENERS + 1 + record
+            owner = start_nodes(group, parameter_file, listeners, composed=composed)
             try:
                 while not group.finished(owner):
                     listen(SLICE)
                     if progress is not None:
                         progress(recorder.samples())
                 drain(recorder, listen)
+                if bag is not None:
+                    close_bag(bag, folder)
             except NodeDied as error:
                 failure = str(error)
         trace = recorder.trace(len(configuration.fam.count))
@@ -109,6 +118,27 @@ def run_graph(
     if failure is not None:
         raise RunFailed(f'{failure} ({recorded} ticks are kept)', trace)
     return trace
+
+
+def start_bag_recorder(
+    group: NodeGroup, parameter_file: Path, bag: Path
+) -> 'subprocess.Popen[bytes]':
+    """Start the recorder of all topics of the root namespace."""
+    command = [executable('fam_bundle_io', 'bag_recorder'), '--ros-args']
+    command += ['--params-file', str(parameter_file), '-p', f'bag.folder:={bag.resolve()}']
+    return group.start('bag_recorder', command)
+
+
+def close_bag(recorder: 'subprocess.Popen[bytes]', folder: Path) -> None:
+    """Tell the recorder to write what it has and to end; raises NodeDied when it cannot."""
+    recorder.send_signal(signal.SIGINT)
+    try:
+        status = recorder.wait(BAG_TIMEOUT)
+    except subprocess.TimeoutExpired:
+        raise NodeDied(f'bag_recorder did not end within {BAG_TIMEOUT:g} s') from None
+    if status != 0:
+        log = folder / 'log' / 'bag_recorder.log'
+        raise NodeDied(f'bag_recorder ended with exit status {status}: see {log}')
 
 
 def drain(recorder: 'TraceRecorder', listen: Callable[[float], None]) -> None:

@@ -392,14 +392,18 @@ def seconds(nanoseconds: int) -> float:
     return nanoseconds / 1e9
 
 
-def write_yaml(configuration: Configuration, path: Path) -> None:
-    """Write ``configuration`` as a ROS 2 parameter file that reads back to the same bits."""
+def yaml_text(configuration: Configuration) -> str:
+    """Return ``configuration`` as a ROS 2 parameter file that reads back to the same bits."""
     import yaml
 
     values = {
         group: {k: list(v) if isinstance(v, tuple) else v for k, v in content.items()}
         for group, content in dataclasses.asdict(configuration).items()
     }
-    text = yaml.safe_dump({'/**': {'ros__parameters': values}}, sort_keys=False)
+    return str(yaml.safe_dump({'/**': {'ros__parameters': values}}, sort_keys=False))
+
+
+def write_yaml(configuration: Configuration, path: Path) -> None:
+    """Write ``configuration`` to a ROS 2 parameter file; whole or not at all."""
     with whole_file(path) as file:
-        file.write(text.encode())
+        file.write(yaml_text(configuration).encode())

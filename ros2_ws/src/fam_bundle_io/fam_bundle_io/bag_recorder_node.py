@@ -1,0 +1,346 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS node that records the topics of a bundle as a rosbag2 bag."""
+
+import fnmatch
+import importlib
+import importlib.metadata
+import json
+import platform
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidParameterTypeException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from fam_bundle_io.bag_writer import BagError, BagWriter, Item, Topic
+from fam_bundle_io.completeness import TopicLedger, carries_tick, shortcomings
+from fam_bundle_io.message_definitions import complete_definition
+from fam_bundle_model.parameters import GROUPS, Configuration, yaml_text
+from fam_bundle_model.schema import ConfigurationError
+from fam_bundle_node.declare import declare_configuration
+
+POLL_PERIOD = 0.01  # s between two times that messages are taken
+LOOK_PERIOD = 0.05  # s between two looks at what topics there are
+SILENCE = 0.2  # s without a message, after which all that was published has come
+DRAIN_TIMEOUT = 5.0  # s
+DEPTH = 10_000  # messages of a topic that may wait for this node
+# The plant waits for its listeners, so this node becomes one when it has the others.
+STARTS_THE_RUN = 'bundle_state'
+LOOP = ('pressure_reference', 'recruitment_state', 'valve_command', STARTS_THE_RUN)
+NOBODYS = ('/rosout', '/parameter_events')  # recorded only where they are named
+PARAMETERS = {
+    'folder': ('', 'folder of the bag; must not exist'),
+    'topics': (['*', '/diagnostics'], 'topics or patterns, relative to the namespace or absolute'),
+    'split_size': (0, 'bytes after which a new file begins [B], 0: never'),
+    'split_duration': (0.0, 'time after which a new file begins [s], 0: never'),
+}
+
+
+class Polled(CallbackGroup):
+    """Keeps its subscriptions from the executor: waking for each message would cost ten times."""
+
+    def can_execute(self, entity: Any) -> bool:
+        """Return False: nothing is for the executor."""
+        return False
+
+    def beginning_execution(self, entity: Any) -> bool:
+        """Return False: nothing is executed."""
+        return False
+
+    def ending_execution(self, entity: Any) -> None:
+        """Nothing was executed."""
+
+
+class BagRecorder(Node):
+    """Takes messages as bytes, and knows their types only to name them."""
+
+    def __init__(self) -> None:
+        """Open the bag; raises ConfigurationError for a bad parameter, BagError for a bad bag."""
+        super().__init__('bag_recorder')
+        try:
+            given = self._declare()
+            self.configuration = self._configuration()
+            self._ledgers: dict[str, TopicLedger] = {}
+            self.skipped: dict[str, str] = {}
+            self._taps: dict[str, Subscription] = {}
+            self._polled = Polled()
+            self.writer = BagWriter(
+                Path(given['folder']),
+                split_size=given['split_size'],
+                split_duration=given['split_duration'],
+                watch=self._note,
+            )
+        except (ConfigurationError, BagError):
+            self.destroy_node()
+            raise
+        self._patterns = given['topics']
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(LOOK_PERIOD, self.look_for_topics, clock=steady)
+
+    def _declare(self) -> dict[str, Any]:
+        given: dict[str, Any] = {}
+        for name, (default, text) in PARAMETERS.items():
+            descriptor = ParameterDescriptor(description=text, read_only=True)
+            try:
+                given[name] = self.declare_parameter(f'bag.{name}', default, descriptor).value
+            except InvalidParameterTypeException as error:
+                raise ConfigurationError(f'bag.{name}: {error}') from None
+        if not given['folder']:
+            raise ConfigurationError("bag.folder = '': must name a folder that does not exist")
+        for name in ('split_size', 'split_duration'):
+            if not given[name] >= 0:
+                raise ConfigurationError(f'bag.{name} = {given[name]}: must be >= 0')
+        return given
+
+    def _configuration(self) -> Configuration | None:
+        """Return the configuration of the bundle where this node was given it."""
+        names = {name.partition('.')[0] for name in self._parameter_overrides}
+        return declare_configuration(self, GROUPS) if names & set(GROUPS) else None
+
+    # ---- What to record ----
+
+    def look_for_topics(self) -> None:
+        """Subscribe to what is new and wanted; to the plant when the rest of the loop is there."""
+        found = dict(self.get_topic_names_and_types())
+        wanted = [name for name in sorted(found) if self.is_wanted(name) and self.is_offered(name)]
+        wanted.sort(key=lambda name: name.endswith(STARTS_THE_RUN))
+        for name in wanted:
+            waits = name.endswith(STARTS_THE_RUN) and not self._has_loop_of(name)
+            if name not in self._ledgers and name not in self.skipped and not waits:
+                self.record(name, found[name][0])
+
+    def is_wanted(self, name: str) -> bool:
+        """Return whether a pattern fits the topic ``name``."""
+        space = self.get_namespace().rstrip('/')
+        for pattern in self._patterns:
+            whole = pattern if pattern.startswith('/') else f'{space}/{pattern}'
+            if name == whole or (fnmatch.fnmatchcase(name, whole) and name not in NOBODYS):
+                return True
+        return False
+
+    def is_offered(self, name: str) -> bool:
+        """Return whether anybody publishes the topic."""
+        return self.count_publishers(name) > 0
+
+    def _has_loop_of(self, state: str) -> bool:
+        space = state.removesuffix(STARTS_THE_RUN)
+        loop = (f'{space}{name}' for name in LOOP if name != STARTS_THE_RUN)
+        return all(name in self._ledgers or not self.is_wanted(name) for name in loop)
+
+    def record(self, name: str, message_type: str) -> None:
+        """Subscribe to a topic and write what comes."""
+        try:
+            package, _, message = message_type.split('/')
+            python_type = getattr(importlib.import_module(f'{package}.msg'), message)
+            definition = complete_definition(message_type)
+        except (ImportError, AttributeError, OSError) as error:
+            self.skipped[name] = f'{error}'
+            self.get_logger().warning(f'{name}: not recorded: {error}')
+            return
+        offered = self.get_publishers_info_by_topic(name)
+        topic = Topic(
+            name,
+            message_type,
+            definition,
+            str(offered[0].topic_type_hash) if offered else '',
+            tuple(qos_of(offer) for offer in offered),
+        )
+        self._ledgers[name] = TopicLedger(ticks=carries_tick(definition))
+        self.writer.add_topic(topic)
+        self._taps[name] = self.create_subscription(
+            python_type,
+            name,
+            lambda message: None,
+            quality_for(offered),
+            callback_group=self._polled,
+            raw=True,
+        )
+
+    def take_all(self) -> bool:
+        """Take what has come on all topics, and return whether anything has."""
+        before = self.writer.taken
+        for name, tap in self._taps.items():
+            handle = tap.handle
+            with handle:
+                while (taken := handle.take_message(tap.msg_type, True)) is not None:
+                    data, info = taken
+                    self.writer.write(
+                        Item(
+                            name,
+                            info['received_timestamp'] or time.time_ns(),
+                            info['source_timestamp'],
+                            info['publication_sequence_number'] or 0,
+                            data,
+                        )
+                    )
+        return self.writer.taken > before
+
+    def _note(self, item: Item) -> None:
+        self._ledgers[item.topic].note(item.sequence, item.data)
+
+    # ---- What the bag says of itself ----
+
+    def close(self) -> list[str]:
+        """Close the bag, return what is missing; raises BagError if the disk did not take all."""
+        self.writer.close(self.records)
+        return list(shortcomings(self.summaries(), self.writer.dropped))
+
+    def summaries(self) -> dict[str, dict[str, Any]]:
+        """Return what came on each topic."""
+        return {name: ledger.summary() for name, ledger in self._ledgers.items()}
+
+    def records(self) -> dict[str, dict[str, str]]:
+        """Return the bag's records of metadata by name."""
+        summaries = self.summaries()
+        missing = [*shortcomings(summaries, self.writer.dropped)]
+        return {
+            'fam_bundle.completeness': {
+                'whole': json.dumps(not missing),
+                'missing': json.dumps(missing),
+                'dropped': json.dumps(self.writer.dropped),
+                'skipped_topics': json.dumps(self.skipped),
+                **{name: json.dumps(summary) for name, summary in summaries.items()},
+            },
+            'fam_bundle.provenance': provenance(self.configuration),
+        }
+
+
+def provenance(configuration: Configuration | None) -> dict[str, str]:
+    """Return what shaped a run: its parameters, where they are known, and versions."""
+    versions = {
+        'python': platform.python_version(),
+        'rmw': rclpy.get_rmw_implementation_identifier(),
+    }
+    for name in ('fam_bundle_io', 'fam_bundle_msgs', 'rclpy', 'numpy', 'mcap'):
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = 'none'
+    found = {'versions': json.dumps(versions)}
+    if configuration is not None:
+        found |= {
+            'parameters': yaml_text(configuration),
+            'parameters_hash': configuration.hash(),
+            'scheme': configuration.recruitment.scheme,
+            'seed': str(configuration.sensors.seed),
+            'period': repr(configuration.simulation.period),
+        }
+    return found
+
+
+def quality_for(offered: list[TopicEndpointInfo]) -> QoSProfile:
+    """Return a quality of service that every offer satisfies."""
+    reliable = all(o.qos_profile.reliability == ReliabilityPolicy.RELIABLE for o in offered)
+    latched = all(o.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offered)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def qos_of(offer: TopicEndpointInfo) -> dict[str, Any]:
+    """Return an offered quality of service in rosbag2's words."""
+    profile = offer.qos_profile
+    times = {
+        name: dict(
+            zip(('sec', 'nsec'), divmod(getattr(profile, name).nanoseconds, 10**9), strict=True)
+        )
+        for name in ('deadline', 'lifespan', 'liveliness_lease_duration')
+    }
+    return {
+        'history': profile.history.name.lower(),
+        'depth': profile.depth,
+        'reliability': profile.reliability.name.lower(),
+        'durability': profile.durability.name.lower(),
+        'deadline': times['deadline'],
+        'lifespan': times['lifespan'],
+        'liveliness': profile.liveliness.name.lower(),
+        'liveliness_lease_duration': times['liveliness_lease_duration'],
+        'avoid_ros_namespace_conventions': False,
+    }
+
+
+# ---- The process ----
+
+
+def record_until_told(recorder: BagRecorder, told: Callable[[], bool]) -> None:
+    """Record until ``told`` and until nothing has come for a moment, or the disk fails."""
+    executor = SingleThreadedExecutor()
+    executor.add_node(recorder)
+
+    def record() -> bool:
+        executor.spin_once(timeout_sec=0.0)
+        time.sleep(POLL_PERIOD)
+        return recorder.take_all()
+
+    try:
+        while not told() and not recorder.writer.failure:
+            record()
+        end = time.monotonic() + DRAIN_TIMEOUT
+        silent = time.monotonic() + SILENCE
+        while time.monotonic() < min(end, silent):
+            if record():
+                silent = time.monotonic() + SILENCE
+    finally:
+        executor.shutdown()
+
+
+def main() -> None:
+    """Record until a signal ends it: status 0, 1 when the disk failed, 2 for a bad parameter."""
+    # The signal must not take the middleware away: what is under way still has to be written.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    told: list[int] = []
+
+    def tell(number: int, frame: FrameType | None) -> None:
+        told.append(number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, tell)
+    sys.exit(run(lambda: bool(told)))
+
+
+def run(told: Callable[[], bool]) -> int:
+    """Record until ``told`` and return the exit status."""
+    try:
+        recorder = BagRecorder()
+    except (ConfigurationError, BagError) as error:
+        print(f'bag_recorder: {error}', file=sys.stderr)
+        return 2
+    log, folder = recorder.get_logger(), recorder.writer.folder
+    log.info(f'recording to {folder}')
+    try:
+        record_until_told(recorder, told)
+    finally:
+        try:
+            missing = recorder.close()
+        except BagError as error:
+            log.fatal(f'{error}')
+            return 1
+        finally:
+            rclpy.try_shutdown()
+    counts = [summary['count'] for summary in recorder.summaries().values()]
+    for line in missing:
+        print(f'bag_recorder: {line}', file=sys.stderr)
+    print(f'bag_recorder: {sum(counts)} messages of {len(counts)} topics in {folder}')
+    return 0

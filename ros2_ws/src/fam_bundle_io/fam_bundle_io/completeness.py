@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a record of the loop is whole: what its ticks and sequence numbers prove."""
+
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+# A message of the loop begins with a header and a tick. In CDR: four bytes that tell the byte
+# order, the stamp (two of four bytes), the length of frame_id, its text, and at the next multiple
+# of eight, counted from the fifth byte, the tick.
+LITTLE_ENDIAN = 1
+FRAME_ID = 16
+MOST_GAPS = 20  # that are named; all are counted
+
+
+def carries_tick(definition: str) -> bool:
+    """Return whether messages of this definition begin with a header and a tick."""
+    lines = (line.partition('#')[0].split() for line in definition.splitlines())
+    fields = [line for line in lines if line][:2]
+    return fields == [['std_msgs/Header', 'header'], ['uint64', 'tick']]
+
+
+def tick_of(data: bytes) -> int:
+    """Return the tick of a serialized message of the loop.
+
+    Raises struct.error when it is too short.
+    """
+    order = '<' if data[1] == LITTLE_ENDIAN else '>'
+    (length,) = struct.unpack_from(f'{order}I', data, FRAME_ID - 4)
+    start = 4 + -(-(FRAME_ID - 4 + length) // 8) * 8
+    (tick,) = struct.unpack_from(f'{order}Q', data, start)
+    return int(tick)
+
+
+class TopicLedger:
+    """Counts what came on one topic and what is missing between."""
+
+    def __init__(self, *, ticks: bool) -> None:
+        """Know nothing yet; ``ticks`` tells whether the messages carry one."""
+        self._has_ticks = ticks
+        self._count, self._runs = 0, 0
+        self._first, self._newest = -1, -1
+        self._missing_ticks, self._repeated_ticks = 0, 0
+        self._gaps: list[tuple[int, int]] = []
+        self._sequence, self._lost = 0, 0
+
+    def note(self, sequence: int, data: bytes) -> None:
+        """Note one message; ``sequence`` is its publisher's number of it, 0 where unknown.
+
+        Raises struct.error when its tick cannot be read.
+        """
+        self._count += 1
+        if not self._has_ticks:
+            return  # such a topic may have many publishers, each with numbers of its own
+        if sequence > self._sequence > 0:
+            self._lost += sequence - self._sequence - 1
+        self._sequence = sequence  # one that goes back is a new publisher's
+        self._note_tick(tick_of(data))
+
+    def _note_tick(self, tick: int) -> None:
+        if tick == 0 and self._newest != 0:
+            self._runs += 1
+            self._first = 0 if self._first < 0 else self._first
+        elif self._newest < 0:
+            self._runs, self._first = 1, tick
+        elif tick > self._newest + 1:
+            self._missing_ticks += tick - self._newest - 1
+            if len(self._gaps) < MOST_GAPS:
+                self._gaps.append((self._newest + 1, tick - 1))
+        elif tick <= self._newest:
+            self._repeated_ticks += 1
+            return
+        self._newest = tick
+
+    def summary(self) -> dict[str, Any]:
+        """Return the counts by name; only the count of messages where they carry no ticks."""
+        found: dict[str, Any] = {'count': self._count}
+        if self._has_ticks:
+            found |= {
+                'lost': self._lost,
+                'first_tick': self._first,
+                'last_tick': self._newest,
+                'runs': self._runs,
+                'missing_ticks': self._missing_ticks,
+                'repeated_ticks': self._repeated_ticks,
+                'gaps': self._gaps,
+            }
+        return found
+
+
+def shortcomings(summaries: dict[str, dict[str, Any]], dropped: int) -> Iterator[str]:
+    """Yield in words what is missing from a record; nothing when it is whole.
+
+    A tick may be missing without being lost: a controller does not answer a stale sample. What
+    was published and not recorded shows in the sequence numbers.
+    """
+    if dropped:
+        yield f'{dropped} messages dropped, for the disk was too slow'
+    for topic, summary in summaries.items():
+        if summary.get('lost'):
+            yield f'{topic}: {summary["lost"]} messages lost before they were recorded'
+        if summary.get('missing_ticks'):
+            gaps = ', '.join(f'{a}-{b}' if b > a else f'{a}' for a, b in summary['gaps'])
+            yield f'{topic}: {summary["missing_ticks"]} ticks without a message ({gaps})'
