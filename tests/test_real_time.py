@@ -20,6 +20,7 @@ from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_bringup.graph import (
     LOOP_LISTENERS,
     drain,
+    drain_patience,
     nodes_in,
     own_domain,
     recording,
@@ -75,7 +76,7 @@ def test_two_bundles_do_not_disturb_each_other_by_a_bit(
             while not group.finished(*owners):
                 listen(0.05)
             for recorder in recorders:
-                drain(recorder, listen)
+                drain(recorder, listen, drain_patience(configuration))
         traces = [recorder.trace(2) for recorder in recorders]
     for trace, configuration in zip(traces, configurations.values(), strict=True):
         assert len(trace['time']) == configuration.ticks()

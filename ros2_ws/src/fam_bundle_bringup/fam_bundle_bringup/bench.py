@@ -22,6 +22,7 @@ from fam_bundle_bringup.experiment import versions
 from fam_bundle_bringup.graph import (
     LOOP_LISTENERS,
     drain,
+    drain_patience,
     nodes_in,
     own_domain,
     recording,
@@ -169,7 +170,7 @@ def graph_runs(
             while not group.finished(*owners):
                 listen(0.05)
             for recorder in recorders:
-                drain(recorder, listen)
+                drain(recorder, listen, drain_patience(configuration))
         return [read_run(folder / 'log' / f'{owner}.log') for owner in owners]
 
 

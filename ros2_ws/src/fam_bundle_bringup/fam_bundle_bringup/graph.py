@@ -32,7 +32,6 @@ OWNERS = ('plant_simulator', 'composed_loop')  # hold the plant, whose end is th
 LOOP_LISTENERS = 3  # strain controller, supervisor, pressure controller
 SLICE = 0.05  # s of listening between two looks at the processes
 BAG_TIMEOUT = 20.0  # s that the bag recorder gets to write what it has
-DRAIN_TIMEOUT = 2.0  # s without a command, after the plant has ended
 
 
 @contextlib.contextmanager
@@ -103,7 +102,7 @@ def run_graph(
                     listen(SLICE)
                     if progress is not None:
                         progress(recorder.samples())
-                drain(recorder, listen)
+                drain(recorder, listen, drain_patience(configuration))
                 if bag is not None:
                     close_bag(bag, folder)
             except NodeDied as error:
@@ -141,13 +140,22 @@ def close_bag(recorder: 'subprocess.Popen[bytes]', folder: Path) -> None:
         raise NodeDied(f'bag_recorder ended with exit status {status}: see {log}')
 
 
-def drain(recorder: 'TraceRecorder', listen: Callable[[float], None]) -> None:
-    """Listen until every sample has its command, or none has come for a while."""
-    waited, commands = 0.0, -1
-    while recorder.commands() < recorder.samples() and waited < DRAIN_TIMEOUT:
-        waited = waited + SLICE if recorder.commands() == commands else 0.0
-        commands = recorder.commands()
+def drain(recorder: 'TraceRecorder', listen: Callable[[float], None], patience: float) -> None:
+    """Listen until every sample has its answers, or none has come for ``patience`` s."""
+    waited, messages = 0.0, -1
+    while recorder.is_behind() and waited < patience:
+        waited = waited + SLICE if recorder.messages() == messages else 0.0
+        messages = recorder.messages()
         listen(SLICE)
+
+
+def drain_patience(configuration: Configuration) -> float:
+    """Return how long (s) the last answers may take.
+
+    In real time a sample may have none. In lock-step each has: a message that was lost on the way
+    is sent again with the middleware's next heartbeat, three seconds later.
+    """
+    return 2.0 if configuration.run.pace == 'realtime' else 10.0
 
 
 def nodes_in(folder: Path) -> NodeGroup:

@@ -194,6 +194,14 @@ class BagRecorder(Node):
                     )
         return self.writer.taken > before
 
+    def is_behind(self) -> bool:
+        """Return whether some topic of the loop has come to an earlier tick than another.
+
+        What was lost on the way is sent again with the middleware's next heartbeat.
+        """
+        ticks = {ledger.newest_tick() for ledger in self._ledgers.values()} - {None}
+        return len(ticks) > 1
+
     def _note(self, item: Item) -> None:
         self._ledgers[item.topic].note(item.sequence, item.data)
 
@@ -299,7 +307,7 @@ def record_until_told(recorder: BagRecorder, told: Callable[[], bool]) -> None:
             record()
         end = time.monotonic() + DRAIN_TIMEOUT
         silent = time.monotonic() + SILENCE
-        while time.monotonic() < min(end, silent):
+        while time.monotonic() < end and (time.monotonic() < silent or recorder.is_behind()):
             if record():
                 silent = time.monotonic() + SILENCE
     finally:

@@ -72,6 +72,10 @@ class TopicLedger:
             return
         self._newest = tick
 
+    def newest_tick(self) -> int | None:
+        """Return the newest tick, None where the messages carry none."""
+        return self._newest if self._has_ticks else None
+
     def summary(self) -> dict[str, Any]:
         """Return the counts by name; only the count of messages where they carry no ticks."""
         found: dict[str, Any] = {'count': self._count}

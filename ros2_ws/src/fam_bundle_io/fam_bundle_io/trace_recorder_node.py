@@ -62,9 +62,13 @@ class TraceRecorder(Node):
         """Return how many samples of the plant have come."""
         return len(self.raw['bundle_state'])
 
-    def commands(self) -> int:
-        """Return how many valve commands have come."""
-        return len(self.raw['valve_command'])
+    def messages(self) -> int:
+        """Return how many messages of the loop have come."""
+        return sum(len(raw) for raw in self.raw.values())
+
+    def is_behind(self) -> bool:
+        """Return whether answers to samples that have come are still missing."""
+        return any(len(raw) < self.samples() for raw in self.raw.values())
 
     def trace(self, units: int) -> Trace:
         """Return the trace of all ticks that came on every topic, each at its first coming."""

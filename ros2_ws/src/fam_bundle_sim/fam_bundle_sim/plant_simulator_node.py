@@ -34,7 +34,7 @@ GROUPS = (
     'reference',
 )
 
-LAST_MESSAGES = Duration(seconds=5)
+LAST_MESSAGES = Duration(seconds=10)
 MATCHING_PERIOD = 0.02  # s between two looks at who listens
 LEFTOVERS = 200  # ticks into a run in which commands of the run before may still come
 SAMPLES = 4096  # whose times are kept for their answers
