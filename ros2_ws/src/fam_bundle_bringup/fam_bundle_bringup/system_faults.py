@@ -138,7 +138,8 @@ def stepped_clock(folder: Path, seconds: int) -> Fault:
             abs(jump - seconds) < 1.0 for jump in jumps.values()
         )
         least = min(jumps, key=lambda node: abs(jumps[node]))
-        words = f'{len(jumps)} clocks, the least jump by {jumps[least]:.0f} s in {least}'
+        silent = ', '.join(sorted(set(PACKAGES) - set(jumps)))
+        words = f'clocks: the least jump by {jumps[least]:.0f} s; silent: {silent or "none"}'
         return both(found, (words, jumped))
 
     return Fault(f'system clock steps by {seconds:+d} s', HARMLESS, hurt, start)

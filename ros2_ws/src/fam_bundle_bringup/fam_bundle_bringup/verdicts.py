@@ -50,9 +50,9 @@ def goes_on(rig: Rig) -> tuple[str, bool]:
 def first_bump(rig: Rig, tick: int) -> float:
     """Return how far the first applied reference from ``tick`` on is from the pressure (Pa).
 
-    That is the pressure of its sample or of the one before, at which the law was kept until then:
-    a unit that is being vented loses some percent in a millisecond. The law's proportional action
-    on what the strain has moved since is no bump.
+    That is the pressure of its sample or of the last one answered before, at which the law was
+    kept until then: a unit that is being vented loses some percent in a millisecond. The law's
+    proportional action on what the strain has moved since is no bump.
     """
     commands = (s.message for s in rig.seen['valve_command'])
     references = {command.tick: command.pressure_reference[0] for command in commands}
@@ -60,7 +60,8 @@ def first_bump(rig: Rig, tick: int) -> float:
     first = min((t for t in references if t >= tick and t in states), default=None)
     if first is None:
         raise RuntimeError(f'no pressure reference from tick {tick} on')
-    now, before = states[first], states.get(first - 1, states[first])
+    last = max((t for t in references if t < first and t in states), default=first)
+    now, before = states[first], states[last]
     gain = rig.configuration.strain_loop.proportional_gain
     moved = gain * abs(now.strain - before.strain)
     low, high = sorted((now.mu_pressure[0], before.mu_pressure[0]))

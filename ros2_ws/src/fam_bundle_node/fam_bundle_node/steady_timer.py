@@ -27,19 +27,16 @@ class SteadyTimer:
         """
         self._node, self._period = node, period
         self._callback, self._failed = callback, failed
-        self._ended, self._called = threading.Event(), threading.Event()
-        self._called.set()
+        self._ended = threading.Event()
         threading.Thread(target=self._run, name='timer', daemon=True).start()
 
     def _run(self) -> None:
         while not self._ended.wait(self._period):
             executor = self._node.executor
-            if executor is not None and self._called.is_set():
-                self._called.clear()
+            if executor is not None:
                 executor.create_task(self._call)
 
     def _call(self) -> None:
-        self._called.set()
         if self._ended.is_set():  # after it was woken
             return
         try:
