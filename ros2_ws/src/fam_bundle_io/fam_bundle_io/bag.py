@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads any bag of a bundle's topics into tables; needs no ROS.
 
-Bags of ``bag_recorder`` and of ``ros2 bag record``: MCAP or SQLite, compressed or not, whole or
-cut short. What could not be read is said in ``Bag.warnings``.
+MCAP or SQLite, whole or cut short, as ``bag_recorder`` and ``rosbags`` write them; compressed bags
+and those of ``ros2 bag record`` follow the same format and have not been tried. What could not be
+read is said in ``Bag.warnings``.
 """
 
 import contextlib

@@ -107,17 +107,14 @@ def test_rosbags_reads_it_message_by_message(bag: Path) -> None:
 def test_mcap_reads_it_message_by_message(bag: Path) -> None:
     from mcap.reader import make_reader
 
+    types = store()
     with (bag / 'whole_0.mcap').open('rb') as file:
         messages = list(make_reader(file).iter_messages())
     assert len(messages) == TICKS
     for tick, (schema, channel, message) in enumerate(messages):
         assert (channel.topic, schema.name, schema.encoding) == ('/sample', TYPE, 'ros2msg')
-        assert message.data == sample_of(tick)
+        assert message.data == sample(types, tick)
         assert (message.sequence, message.publish_time) == (tick + 1, 10**18 + tick - 5)
-
-
-def sample_of(tick: int, types: Any = store()) -> bytes:  # noqa: B008
-    return sample(types, tick)
 
 
 def test_a_bag_rotates_by_size_and_is_read_as_one(tmp_path: Path) -> None:
@@ -257,10 +254,10 @@ def test_only_what_begins_with_header_and_tick_carries_one() -> None:
 
 
 def ledger_of(ticks: list[int], sequences: list[int] | None = None) -> dict[str, Any]:
-    ledger = completeness.TopicLedger(ticks=True)
+    types, ledger = store(), completeness.TopicLedger(ticks=True)
     for number, tick in enumerate(ticks):
         sequence = sequences[number] if sequences else number + 1
-        ledger.note(sequence, sample_of(tick))
+        ledger.note(sequence, sample(types, tick))
     return ledger.summary()
 
 
