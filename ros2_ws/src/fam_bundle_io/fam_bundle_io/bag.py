@@ -17,7 +17,12 @@ from fam_bundle_io import cdr
 from fam_bundle_io.bag_files import Damage, Messages, read_parts
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_io.trace import Trace, empty_trace
-from fam_bundle_model.parameters import seconds
+from fam_bundle_model.parameters import (
+    Configuration,
+    make_configuration,
+    parse_yaml,
+    seconds,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -191,6 +196,17 @@ def _joined(parts: list[np.ndarray]) -> Any:
 
 
 # ---- One run of the loop ----
+
+
+def recorded_configuration(bag: Bag) -> Configuration | None:
+    """Return the configuration that the recorder noted in the bag, None where it did not.
+
+    Raises ConfigurationError when it is damaged.
+    """
+    text = bag.records.get('fam_bundle.provenance', {}).get('parameters')
+    if text is None:
+        return None
+    return make_configuration(parse_yaml(text, 'parameters in the bag'))
 
 
 class Run(NamedTuple):

@@ -350,20 +350,32 @@ def read_yaml(path: Path) -> dict[str, dict[str, Any]]:
 
     Raises ConfigurationError when the file cannot be read or has another layout.
     """
+    try:
+        text = Path(path).read_text(encoding='utf-8')
+    except OSError as error:
+        raise ConfigurationError(f'{path}: cannot be read ({error.strerror})') from None
+    except UnicodeDecodeError as error:
+        raise ConfigurationError(f'{path}: not YAML ({error})') from None
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, source: str) -> dict[str, dict[str, Any]]:
+    """Return the parameters in the text of a ROS 2 parameter file, by group.
+
+    Raises ConfigurationError that begins with ``source`` when it has another layout.
+    """
     import yaml
 
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except OSError as error:
-        raise ConfigurationError(f'{path}: cannot be read ({error.strerror})') from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f'{path}: not YAML ({" ".join(str(error).split())})') from None
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigurationError(f'{source}: not YAML ({" ".join(str(error).split())})') from None
     try:
         parameters = content['/**']['ros__parameters']
         if not isinstance(parameters, dict):
             raise TypeError
     except (KeyError, TypeError):
-        raise ConfigurationError(f"{path}: must hold '/**: ros__parameters:'") from None
+        raise ConfigurationError(f"{source}: must hold '/**: ros__parameters:'") from None
     return parameters
 
 
