@@ -210,10 +210,14 @@ def recorded_configuration(bag: Bag) -> Configuration | None:
 
 
 class Run(NamedTuple):
-    """One run of the loop: its trace, and what it lacks, in words."""
+    """One run of the loop: its trace, and what it lacks, in words.
+
+    The bag does not hold the signals that are ``missing``: they are NaN, or zero in whole numbers.
+    """
 
     trace: Trace
     warnings: list[str]
+    missing: frozenset[str]
 
 
 def loop_topics(bag: Bag) -> dict[str, list[str]]:
@@ -263,7 +267,8 @@ def trace_of(bag: Bag, namespace: str = '', run: int = -1) -> Run:
                     trace[signal][:, unit] = rows[f'{column}[{unit}]']
             else:
                 trace[signal][:] = rows[column]
-    return Run(trace, warnings)
+    missing = {s for name in COLUMNS if name not in tables for s in COLUMNS[name]}
+    return Run(trace, warnings, frozenset(missing))
 
 
 def one_run(table: 'pd.DataFrame', run: int) -> 'pd.DataFrame':
