@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: ``./fam experiment``, ``./fam demo``, ``./fam bench`` and ``./fam top``."""
+"""The command line: what ``./fam`` passes on."""
 
 import argparse
 import math
@@ -10,6 +10,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from fam_bundle_bringup.bag_commands import NAMES as BAG_COMMANDS
+from fam_bundle_bringup.bag_commands import add_bag_commands, run_bag_command
 from fam_bundle_bringup.domain_marker import domain_number
 from fam_bundle_bringup.experiment import (
     PACES,
@@ -54,6 +56,7 @@ def parser() -> Parser:
     _add_common(faults, Path('runs/faults'))
     faults.add_argument('--only', default='', metavar='TEXT', help='faults that contain TEXT')
     _add_top(commands)
+    add_bag_commands(commands)
     return top
 
 
@@ -230,6 +233,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
             run_top(options.domain, options.seconds)
             return 0
+        if options.command in BAG_COMMANDS:
+            return run_bag_command(options)
         results = RESULTS if options.command == 'experiment' else ()
         changes = changes_of(options) if options.command == 'experiment' else {}
         if options.command == 'experiment' and options.composed and options.pace == 'offline':

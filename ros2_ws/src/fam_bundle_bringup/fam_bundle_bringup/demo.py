@@ -2,6 +2,7 @@
 """The paper's experiment under every scheme: Table 2, its figures, and how alike they are."""
 
 import dataclasses
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from fam_bundle_io.metrics import Tracking
 from fam_bundle_io.shapes import Claim, paper_claims
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import SCHEMES, Configuration
+from fam_bundle_model.schema import ConfigurationError
 
 PAPER = {
     'baseline': Tracking(0.0454, 0.0223),
@@ -33,7 +35,10 @@ def run_demo(configuration: Configuration, folder: Path) -> None:
         recruitment = dataclasses.replace(configuration.recruitment, scheme=scheme)
         one = dataclasses.replace(configuration, recruitment=recruitment)
         with progress_bar(f'{scheme}, through the graph', one.ticks()) as progress:
-            results[scheme] = run_experiment(one, 'lockstep', folder / scheme, progress)
+            remove_bag(folder / scheme / 'bag')
+            results[scheme] = run_experiment(
+                one, 'lockstep', folder / scheme, progress, record=True
+            )
     tracked = {scheme: _tracking(result) for scheme, result in results.items()}
     table = {scheme: tracked[scheme]._asdict() for scheme in PAPER}
     write_json(table, folder / 'table2.json')
@@ -50,6 +55,24 @@ def run_demo(configuration: Configuration, folder: Path) -> None:
     print_table(tracked, rival)
     print_claims(claims)
     print(f'{len(figures)} figures and all results in {folder}')
+    print(f'explore the runs: ./fam report {folder}/*/bag --out {folder / "report"}')
+
+
+def remove_bag(bag: Path) -> None:
+    """Remove the bag of an earlier demo, if there is one, whole or not.
+
+    Raises ConfigurationError where there is anything else in its place.
+    """
+    if not bag.exists() and not bag.is_symlink():
+        return
+    if bag.is_symlink() or not bag.is_dir() or any(not is_of_a_bag(p) for p in bag.iterdir()):
+        raise ConfigurationError(f'{bag}: holds more than the bag of a demo: name another --out')
+    shutil.rmtree(bag)
+
+
+def is_of_a_bag(path: Path) -> bool:
+    """Return whether a recorder may have made ``path``."""
+    return path.suffix == '.mcap' or path.stem == 'metadata'
 
 
 def _tracking(result: Result) -> Tracking:

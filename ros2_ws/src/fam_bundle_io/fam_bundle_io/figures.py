@@ -10,11 +10,13 @@ from fam_bundle_io.figures_model import (
     source_figure,
     surface_figure,
 )
+from fam_bundle_io.figures_report import energy_figure, timing_figure
 from fam_bundle_io.figures_runs import comparison_figure, prediction_figure, run_figure
 from fam_bundle_io.figures_style import save_figures
 
 __all__ = [
     'comparison_figure',
+    'energy_figure',
     'lag_table_figure',
     'prediction_figure',
     'response_figure',
@@ -22,4 +24,5 @@ __all__ = [
     'save_figures',
     'source_figure',
     'surface_figure',
+    'timing_figure',
 ]

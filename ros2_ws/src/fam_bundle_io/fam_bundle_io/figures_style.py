@@ -12,6 +12,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from fam_bundle_io.metrics import valleys
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.files import whole_file
 
@@ -60,15 +61,13 @@ def last_cycle(trace: Trace) -> slice:
 
     All ticks where the reference has no valley inside the run.
     """
-    reference = signal(trace, 'strain_reference')
-    inner = (reference[1:-1] < reference[:-2]) & (reference[1:-1] <= reference[2:])
-    valleys = [0, *(np.flatnonzero(inner) + 1).tolist(), len(reference)]
-    lengths = np.diff(valleys)
+    marks = valleys(signal(trace, 'strain_reference'))
+    lengths = np.diff(marks)
     # A run that was stopped ends in a part of a cycle.
     last = len(lengths) - 1
     if last > 0 and lengths[last] < 0.99 * lengths[last - 1]:
         last -= 1
-    return slice(valleys[last], valleys[last + 1])
+    return slice(marks[last], marks[last + 1])
 
 
 def mark(axes: Axes, times: list[float]) -> None:

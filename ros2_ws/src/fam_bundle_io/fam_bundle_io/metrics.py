@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a run tracked its reference (equations 17 and 18)."""
+"""What a trace says of a run: tracking (equations 17 and 18), shifts, states, saturation."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from fam_bundle_io.trace import Trace
+from fam_bundle_model.parameters import Configuration
+
+SATURATED = 0.97  # share of the source pressure from which a unit counts as saturated
+SLACK = 1e-9  # s by which rounding may move the edge of a window
 
 
 class Tracking(NamedTuple):
@@ -13,6 +19,13 @@ class Tracking(NamedTuple):
 
     iae: float
     max_error: float
+
+
+class Window(NamedTuple):
+    """Start and end of a part of a run in s; the end does not belong to it."""
+
+    start: float
+    stop: float
 
 
 def tracking(trace: Trace, start: float, stop: float) -> Tracking:
@@ -23,13 +36,25 @@ def tracking(trace: Trace, start: float, stop: float) -> Tracking:
 
     Raises ValueError when the trace has fewer than two ticks in that window.
     """
-    time = trace['time']
-    window = (time >= start - 1e-9) & (time < stop - 1e-9)
+    window = ticks_in(trace, Window(start, stop))
     if np.count_nonzero(window) < 2:
         raise ValueError(f'the trace has no ticks from {start:g} s to {stop:g} s')
     error = np.abs(trace['strain_reference'] - trace['strain'])[window]
-    step = np.diff(time[window], append=stop)
+    step = np.diff(trace['time'][window], append=stop)
     return Tracking(float((error * step).sum()), float(error.max()))
+
+
+def ticks_in(trace: Trace, window: Window) -> npt.NDArray[np.bool_]:
+    """Return which ticks lie in ``window``."""
+    time = trace['time']
+    found = (time >= window.start - SLACK) & (time < window.stop - SLACK)
+    return np.asarray(found, dtype=np.bool_)
+
+
+def steps(trace: Trace) -> npt.NDArray[np.float64]:
+    """Return the time in s that each tick stands for; the last one as long as most do."""
+    step = np.diff(trace['time'])
+    return np.append(step, np.median(step) if step.size else 0.0)
 
 
 def shift_times(trace: Trace) -> tuple[list[float], list[float]]:
@@ -37,3 +62,53 @@ def shift_times(trace: Trace) -> tuple[list[float], list[float]]:
     change = np.diff(trace['recruitment_state'].astype(int), prepend=1)
     time = trace['time']
     return time[change > 0].tolist(), time[change < 0].tolist()
+
+
+# ---- Cycles ----
+
+
+def valleys(reference: npt.NDArray[np.float64]) -> list[int]:
+    """Return the first tick, those of the reference's valleys inside the run, and its end."""
+    inner = (reference[1:-1] < reference[:-2]) & (reference[1:-1] <= reference[2:])
+    return [0, *(np.flatnonzero(inner) + 1).tolist(), len(reference)]
+
+
+def whole_cycles(trace: Trace, configuration: Configuration | None = None) -> list[Window]:
+    """Return the cycles of the reference that the trace holds from their first tick to the last.
+
+    Where no ``configuration`` tells them they are taken from valley to valley of the reference.
+    """
+    time, step = trace['time'], float(steps(trace)[-1])
+    if configuration is not None:
+        frequency = configuration.reference.frequency
+        cycles = [
+            Window(k / frequency, (k + 1) / frequency)
+            for k in range(configuration.reference.cycles)
+        ]
+    else:
+        edges = [*time.tolist(), float(time[-1]) + step]
+        marks = valleys(trace['strain_reference'])
+        cycles = [Window(edges[a], edges[b]) for a, b in pairwise(marks)]
+        longest = max(cycle.stop - cycle.start for cycle in cycles)
+        cycles = [cycle for cycle in cycles if cycle.stop - cycle.start > 0.99 * longest]
+    # In real time the first or last period of a cycle may be skipped.
+    slack = 1.5 * step
+    return [c for c in cycles if c.start > time[0] - slack and c.stop < time[-1] + step + slack]
+
+
+# ---- States and saturation ----
+
+
+def time_in_state(trace: Trace, window: Window) -> dict[int, float]:
+    """Return the time in s within ``window`` for which each number of units was recruited."""
+    inside = ticks_in(trace, window)
+    state, step = trace['recruitment_state'][inside], steps(trace)[inside]
+    return {int(k): float(step[state == k].sum()) for k in np.unique(state)}
+
+
+def time_at_source(trace: Trace, window: Window) -> list[float]:
+    """Return the time in s within ``window`` at which each unit was at the source pressure."""
+    inside = ticks_in(trace, window)
+    source = trace['source_pressure'][inside, None]
+    at_source = trace['mu_pressure'][inside] >= SATURATED * source
+    return [float(t) for t in (at_source * steps(trace)[inside, None]).sum(axis=0)]

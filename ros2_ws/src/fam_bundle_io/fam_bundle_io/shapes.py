@@ -7,12 +7,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fam_bundle_io.metrics import shift_times
+from fam_bundle_io.metrics import SATURATED, shift_times
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration
 
 AFTER = 1.5  # s after an upshift that count as immediately following it
-SATURATED = 0.97  # share of the source pressure from which a unit counts as saturated
 
 
 class Claim(NamedTuple):

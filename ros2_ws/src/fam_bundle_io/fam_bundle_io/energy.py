@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the hydraulic energy of a run goes: into the load, and into the valves.
+
+Our derivation. The source gives ``p_s Q_s``. Of that, the oil that enters unit i at its pressure
+carries ``p_i Q_i`` into the muscles; ``(p_s - p_i) Q_i`` is lost in valve and hose on the way, and
+``p_i Q_i`` of what leaves on its way to the tank. The load gets ``F L0`` per unit strain.
+Force, strain, pressures and the source's flow are measured; the flow of each unit is not: it comes
+from the spool commands and pressures by equations 5 and 6.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fam_bundle_io.metrics import Window, steps, ticks_in
+from fam_bundle_io.trace import Trace
+from fam_bundle_model.compile import compiled
+from fam_bundle_model.hydraulics import HydraulicLaw, hydraulic_law, unit_flow
+from fam_bundle_model.parameters import Configuration
+
+Array = npt.NDArray[np.float64]
+
+SMOOTHING = 0.05  # s over which the strain is averaged to tell contraction from lengthening
+
+
+class Powers(NamedTuple):
+    """Powers in W at every tick: (ticks,), or (ticks, units) for those of motor units.
+
+    ``load`` is what the bundle does on the load, negative where the load drives it;
+    ``contracting`` tells at which ticks the bundle shortens. ``flow`` (ticks, units) is the
+    modelled flow into each unit (m^3/s), negative out of it.
+    """
+
+    source: Array
+    load: Array
+    contracting: npt.NDArray[np.bool_]
+    supply_loss: Array
+    return_loss: Array
+    flow: Array
+
+
+class Energy(NamedTuple):
+    """Energies in J over a window; those of motor units as lists.
+
+    ``output`` is done on the load while the bundle contracts, ``returned`` is what the load gives
+    back while it lengthens. ``efficiency`` is ``output / hydraulic_input``. ``unexplained`` is
+    what the input leaves after work and losses: change of stored energy, and the errors of
+    sensors and model. ``modelled_oil`` is the modelled flow into all units over the measured one.
+    """
+
+    hydraulic_input: float
+    output: float
+    returned: float
+    supply_loss: list[float]
+    return_loss: list[float]
+    unexplained: float
+    efficiency: float
+    modelled_oil: float
+
+
+@compiled
+def _spool_and_flow(
+    law: HydraulicLaw,
+    step: Array,
+    command: Array,
+    source: Array,
+    pressure: Array,
+    flow: Array,
+) -> None:
+    """Fill ``flow`` (ticks, units): each command acts from its tick on, behind the spool's lag."""
+    for unit in range(command.shape[1]):
+        spool = 0.0
+        for tick in range(command.shape[0]):
+            flow[tick, unit] = unit_flow(law, spool, source[tick], pressure[tick, unit])
+            decay = math.exp(-step[tick] / law.spool_time_constant)
+            spool = command[tick, unit] + (spool - command[tick, unit]) * decay
+
+
+def powers(trace: Trace, configuration: Configuration) -> Powers:
+    """Return all powers of a run that begins with the valves at rest."""
+    law, step = hydraulic_law(configuration), steps(trace)
+    source, pressure = trace['source_pressure'], trace['mu_pressure']
+    flow = np.zeros_like(pressure)
+    _spool_and_flow(law, step, trace['spool'], source, pressure, flow)
+    length = configuration.fam.length[0]
+    speed = np.gradient(trace['strain'], trace['time'])
+    return Powers(
+        source=source * trace['source_flow'],
+        load=trace['force'] * length * speed,
+        contracting=_contracting(trace['strain'], float(np.median(step))),
+        supply_loss=np.clip(flow, 0.0, None) * (source[:, None] - pressure),
+        return_loss=np.clip(-flow, 0.0, None) * pressure,
+        flow=flow,
+    )
+
+
+def _contracting(strain: Array, step: float) -> npt.NDArray[np.bool_]:
+    from scipy.ndimage import uniform_filter1d
+
+    smooth = uniform_filter1d(strain, max(round(SMOOTHING / step), 1))
+    return np.asarray(np.gradient(smooth) > 0.0, dtype=np.bool_)
+
+
+def energy(trace: Trace, found: Powers, window: Window) -> Energy:
+    """Return what the powers ``found`` in ``trace`` come to within ``window``."""
+    inside = ticks_in(trace, window)
+    step = steps(trace)[inside]
+
+    def total(power: Array) -> float:
+        return float((power[inside] * step).sum())
+
+    def of_units(power: Array) -> list[float]:
+        return [float(e) for e in (power[inside] * step[:, None]).sum(axis=0)]
+
+    given = total(found.source)
+    output = total(np.where(found.contracting, found.load, 0.0))
+    returned = -total(np.where(found.contracting, 0.0, found.load))
+    supply, back = of_units(found.supply_loss), of_units(found.return_loss)
+    oil = total(trace['source_flow'])
+    return Energy(
+        hydraulic_input=given,
+        output=output,
+        returned=returned,
+        supply_loss=supply,
+        return_loss=back,
+        unexplained=given - (output - returned) - sum(supply) - sum(back),
+        efficiency=output / given if given > 0.0 else math.nan,
+        modelled_oil=total(np.clip(found.flow, 0.0, None).sum(axis=1)) / oil if oil else math.nan,
+    )
