@@ -32,7 +32,7 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from fam_bundle_io.bag_writer import BagError, BagWriter, Item, Topic
-from fam_bundle_io.completeness import TopicLedger, carries_tick, shortcomings
+from fam_bundle_io.completeness import TopicLedger, carries_tick, record_of, shortcomings
 from fam_bundle_io.message_definitions import complete_definition
 from fam_bundle_model.parameters import GROUPS, Configuration, yaml_text
 from fam_bundle_model.schema import ConfigurationError
@@ -87,6 +87,7 @@ class BagRecorder(Node):
                 Path(given['folder']),
                 split_size=given['split_size'],
                 split_duration=given['split_duration'],
+                head={'fam_bundle.provenance': provenance(self.configuration)},
                 watch=self._note,
             )
         except (ConfigurationError, BagError):
@@ -217,19 +218,9 @@ class BagRecorder(Node):
         return {name: ledger.summary() for name, ledger in self._ledgers.items()}
 
     def records(self) -> dict[str, dict[str, str]]:
-        """Return the bag's records of metadata by name."""
-        summaries = self.summaries()
-        missing = [*shortcomings(summaries, self.writer.dropped)]
-        return {
-            'fam_bundle.completeness': {
-                'whole': json.dumps(not missing),
-                'missing': json.dumps(missing),
-                'dropped': json.dumps(self.writer.dropped),
-                'skipped_topics': json.dumps(self.skipped),
-                **{name: json.dumps(summary) for name, summary in summaries.items()},
-            },
-            'fam_bundle.provenance': provenance(self.configuration),
-        }
+        """Return the records of metadata that end the bag, by name."""
+        found = record_of(self.summaries(), self.writer.dropped, self.skipped)
+        return {'fam_bundle.completeness': found}
 
 
 def provenance(configuration: Configuration | None) -> dict[str, str]:
@@ -307,7 +298,11 @@ def record_until_told(recorder: BagRecorder, told: Callable[[], bool]) -> None:
             record()
         end = time.monotonic() + DRAIN_TIMEOUT
         silent = time.monotonic() + SILENCE
-        while time.monotonic() < end and (time.monotonic() < silent or recorder.is_behind()):
+        while (
+            not recorder.writer.failure
+            and time.monotonic() < end
+            and (time.monotonic() < silent or recorder.is_behind())
+        ):
             if record():
                 silent = time.monotonic() + SILENCE
     finally:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes a rosbag2 bag (MCAP) in a thread of its own; knows no ROS.
+"""Writes a rosbag2 bag (MCAP), in a thread of its own where messages must not wait; knows no ROS.
 
 The folder, its ``metadata.yaml`` and the contents of the MCAP files follow rosbag2's storage
 version 9 (Jazzy). The format itself is the ``mcap`` package's.
@@ -16,11 +16,15 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from fam_bundle_model.files import whole_file
+
+Records = Mapping[str, Mapping[str, str]]  # of metadata, by name
+
 VERSION = 9  # of rosbag2's metadata
-CHUNK = 256 * 1024  # bytes; a crash loses the last one
+CHUNK = 256 * 1024  # bytes; a crash loses the one under way
 MEMORY = 32 * 1024 * 1024  # bytes of messages that may wait for the disk
 LOOK_PERIOD = 0.1  # s between two looks at what has come
-SYNC_PERIOD = 1.0  # s between two times that the file is on the disk for sure
+SYNC_PERIOD = 0.5  # s between two times that a chunk ends and the file is on the disk for sure
 
 
 class BagError(Exception):
@@ -54,7 +58,6 @@ class BagWriter:
     """Takes messages from one thread, and writes them in another.
 
     What waits is bounded by ``memory`` bytes; beyond it messages are dropped and counted.
-    A new file begins after ``split_size`` bytes or ``split_duration`` s (0: never).
     """
 
     def __init__(
@@ -64,32 +67,27 @@ class BagWriter:
         split_size: int = 0,
         split_duration: float = 0.0,
         memory: int = MEMORY,
+        head: Records | None = None,
         watch: Callable[[Item], None] | None = None,
     ) -> None:
         """Make ``folder``; raises BagError when it exists or cannot be made.
 
-        ``watch`` gets every message in the writing thread.
+        ``watch`` gets every message in the writing thread; the others are as in BagFolder.
         """
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            raise BagError(f'{folder}: exists; a bag never overwrites') from None
-        except OSError as error:
-            raise BagError(f'{folder}: {error.strerror}') from None
+        self._bag = BagFolder(
+            folder, split_size=split_size, split_duration=split_duration, head=head
+        )
         self.folder, self.dropped, self.failure = folder, 0, ''
-        self._split_size, self._split_duration, self._memory = split_size, split_duration, memory
-        self._watch = watch or (lambda item: None)
-        self._topics: dict[str, Topic] = {}
+        self._memory, self._watch = memory, watch or (lambda item: None)
         self._waiting: deque[Item] = deque()
         self.taken, self._written = 0, 0  # bytes
-        self._files: list[BagFile] = []
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._run, name='bag', daemon=True)
         self._thread.start()
 
     def add_topic(self, topic: Topic) -> None:
         """Make a topic known before its first message."""
-        self._topics[topic.name] = topic
+        self._bag.add_topic(topic)
 
     def write(self, item: Item) -> None:
         """Take a message."""
@@ -99,18 +97,19 @@ class BagWriter:
         self.taken += len(item.data)
         self._waiting.append(item)
 
-    def close(self, metadata: Callable[[], Mapping[str, Mapping[str, str]]] = dict) -> None:
-        """Write what waits, the records of ``metadata`` by name, and ``metadata.yaml``.
+    def close(self, records: Callable[[], Records] = dict) -> None:
+        """Write what waits, the ``records`` of metadata by name, and ``metadata.yaml``.
 
         Raises BagError when the disk did not take all.
         """
         self._end.set()
         self._thread.join()
-        records = metadata()
+        found = records()
         try:
-            if self._files and not self.failure:
-                self._files[-1].close(records)
-            self._write_metadata(records)
+            if self.failure:
+                self._bag.abandon(found)
+            else:
+                self._bag.close(found)
         except OSError as error:
             self.failure = self.failure or self._because(error)
         if self.failure:
@@ -123,8 +122,8 @@ class BagWriter:
             synced = time.monotonic()
             while not (self._end.wait(LOOK_PERIOD) and not self._waiting):
                 self._write_waiting()
-                if self._files and time.monotonic() - synced > SYNC_PERIOD:
-                    self._files[-1].sync()
+                if time.monotonic() - synced > SYNC_PERIOD:
+                    self._bag.sync()
                     synced = time.monotonic()
         except OSError as error:
             self.failure = self._because(error)
@@ -132,15 +131,53 @@ class BagWriter:
             self.failure = f'{self.folder}: {type(error).__name__}: {error}'
 
     def _because(self, error: OSError) -> str:
-        written = sum(sum(file.counts.values()) for file in self._files)
-        return f'{self.folder}: {error.strerror} after {written} messages'
+        return f'{self.folder}: {error.strerror} after {self._bag.messages()} messages'
 
     def _write_waiting(self) -> None:
         while self._waiting:
             item = self._waiting.popleft()
-            self._file_for(item).write(item)
+            self._bag.write(item)
             self._written += len(item.data)
             self._watch(item)
+
+
+class BagFolder:
+    """A bag on the disk: its files, one after the other, and ``metadata.yaml``."""
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        name: str = '',
+        split_size: int = 0,
+        split_duration: float = 0.0,
+        head: Records | None = None,
+    ) -> None:
+        """Make ``folder``; raises BagError when it exists or cannot be made.
+
+        Its files are called ``name``, or as the folder. A new one begins after ``split_size``
+        bytes or ``split_duration`` s (0: never); each begins with the records of metadata
+        ``head``, which a crash then does not lose.
+        """
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            raise BagError(f'{folder}: exists; a bag never overwrites') from None
+        except OSError as error:
+            raise BagError(f'{folder}: {error.strerror}') from None
+        self.folder, self._name = folder, name or folder.name
+        self._split_size, self._split_duration = split_size, split_duration
+        self._head = head or {}
+        self._topics: dict[str, Topic] = {}
+        self._files: list[BagFile] = []
+
+    def add_topic(self, topic: Topic) -> None:
+        """Make a topic known before its first message."""
+        self._topics[topic.name] = topic
+
+    def write(self, item: Item) -> None:
+        """Write one message."""
+        self._file_for(item).write(item)
 
     def _file_for(self, item: Item) -> 'BagFile':
         if not self._files:
@@ -154,29 +191,58 @@ class BagWriter:
         return self._files[-1]
 
     def _new_file(self) -> 'BagFile':
-        name = f'{self.folder.name}_{len(self._files)}.mcap'
-        return BagFile(self.folder / name, self._topics)
+        name = f'{self._name}_{len(self._files)}.mcap'
+        return BagFile(self.folder / name, self._topics, self._head)
 
-    def _write_metadata(self, records: Mapping[str, Mapping[str, str]]) -> None:
-        path = self.folder / 'metadata.yaml'
-        part = path.with_suffix('.part')
-        information = bag_information(self._files, self._topics, records)
-        part.write_text(yaml.safe_dump(information, sort_keys=False))
-        part.replace(path)
+    def messages(self) -> int:
+        """Return how many messages were written."""
+        return sum(sum(file.counts.values()) for file in self._files)
+
+    def sync(self) -> None:
+        """Bring all that was written onto the disk."""
+        if self._files:
+            self._files[-1].sync()
+
+    def close(self, records: Records) -> None:
+        """Write the ``records`` of metadata by name, the last index, and ``metadata.yaml``."""
+        if self._files:
+            self._files[-1].close(records)
+        self._write_metadata(records)
+
+    def abandon(self, records: Records) -> None:
+        """Write ``metadata.yaml`` beside a file that the disk did not take."""
+        if self._files:
+            self._files[-1].abandon()
+        self._write_metadata(records)
+
+    def _write_metadata(self, records: Records) -> None:
+        information = bag_information(self._files, self._topics, {**self._head, **records})
+        with whole_file(self.folder / 'metadata.yaml') as file:
+            file.write(yaml.safe_dump(information, sort_keys=False).encode())
 
 
 class BagFile:
     """One MCAP file of a bag."""
 
-    def __init__(self, path: Path, topics: Mapping[str, Topic]) -> None:
-        """Create the file; it must not be there."""
+    def __init__(self, path: Path, topics: Mapping[str, Topic], head: Records) -> None:
+        """Create the file, which must not be there, with the records ``head`` at its beginning."""
         from mcap.writer import CompressionType, Writer
 
         self.path, self.counts, self.first, self.last = path, dict[str, int](), 0, 0
         self._topics, self._channels = topics, dict[str, int]()
         self._stream = path.open('xb')
-        self._writer = Writer(self._stream, chunk_size=CHUNK, compression=CompressionType.LZ4)
+        self._writer = Writer(
+            self._stream,
+            chunk_size=CHUNK,
+            compression=CompressionType.LZ4,
+            enable_data_crcs=True,  # chunks have their own; this is for what is between them
+        )
         self._writer.start(profile='ros2', library='fam_bundle')
+        self._add(head)
+
+    def _add(self, records: Records) -> None:
+        for name, values in records.items():
+            self._writer.add_metadata(name, dict(values))
 
     def write(self, item: Item) -> None:
         """Write one message."""
@@ -186,8 +252,7 @@ class BagFile:
         self._writer.add_message(
             channel, item.received, item.data, item.published, item.sequence & 0xFFFFFFFF
         )
-        if not self.counts:
-            self.first = item.received
+        self.first = min(self.first, item.received) if self.counts else item.received
         self.last = max(self.last, item.received)
         self.counts[item.topic] = self.counts.get(item.topic, 0) + 1
 
@@ -208,23 +273,28 @@ class BagFile:
         return self._stream.tell()
 
     def sync(self) -> None:
-        """Bring what is whole onto the disk."""
-        self._stream.flush()
+        """End the chunk under way and bring all onto the disk."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
         os.fsync(self._stream.fileno())
 
-    def close(self, records: Mapping[str, Mapping[str, str]]) -> None:
+    def close(self, records: Records) -> None:
         """Add the ``records`` of metadata, the index, and close the file."""
         with contextlib.closing(self._stream):
-            for name, values in records.items():
-                self._writer.add_metadata(name, dict(values))
+            self._add(records)
             self._writer.finish()  # type: ignore[no-untyped-call]
-            self.sync()
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+
+    def abandon(self) -> None:
+        """Close the file as it is; the disk may refuse what still waits for it."""
+        with contextlib.suppress(OSError):
+            self._stream.close()
 
 
 def bag_information(
     files: 'list[BagFile]',
     topics: Mapping[str, Topic],
-    records: Mapping[str, Mapping[str, str]],
+    records: Records,
 ) -> dict[str, Any]:
     """Return what ``metadata.yaml`` holds."""
     counts = {name: sum(file.counts.get(name, 0) for file in files) for name in topics}

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether a record of the loop is whole: what its ticks and sequence numbers prove."""
 
+import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 # A message of the loop begins with a header and a tick. In CDR: four bytes that tell the byte
@@ -23,7 +24,7 @@ def carries_tick(definition: str) -> bool:
 def tick_of(data: bytes) -> int:
     """Return the tick of a serialized message of the loop.
 
-    Raises struct.error when it is too short.
+    Raises struct.error or IndexError when it is too short.
     """
     order = '<' if data[1] == LITTLE_ENDIAN else '>'
     (length,) = struct.unpack_from(f'{order}I', data, FRAME_ID - 4)
@@ -40,22 +41,24 @@ class TopicLedger:
         self._has_ticks = ticks
         self._count, self._runs = 0, 0
         self._first, self._newest = -1, -1
-        self._missing_ticks, self._repeated_ticks = 0, 0
+        self._missing_ticks, self._repeated_ticks, self._without_tick = 0, 0, 0
         self._gaps: list[tuple[int, int]] = []
         self._sequence, self._lost = 0, 0
 
     def note(self, sequence: int, data: bytes) -> None:
-        """Note one message; ``sequence`` is its publisher's number of it, 0 where unknown.
-
-        Raises struct.error when its tick cannot be read.
-        """
+        """Note one message; ``sequence`` is its publisher's number of it, 0 where unknown."""
         self._count += 1
         if not self._has_ticks:
             return  # such a topic may have many publishers, each with numbers of its own
         if sequence > self._sequence > 0:
             self._lost += sequence - self._sequence - 1
         self._sequence = sequence  # one that goes back is a new publisher's
-        self._note_tick(tick_of(data))
+        try:
+            tick = tick_of(data)
+        except (struct.error, IndexError):
+            self._without_tick += 1
+        else:
+            self._note_tick(tick)
 
     def _note_tick(self, tick: int) -> None:
         if tick == 0 and self._newest != 0:
@@ -87,12 +90,32 @@ class TopicLedger:
                 'runs': self._runs,
                 'missing_ticks': self._missing_ticks,
                 'repeated_ticks': self._repeated_ticks,
+                'without_tick': self._without_tick,
                 'gaps': self._gaps,
             }
         return found
 
 
-def shortcomings(summaries: dict[str, dict[str, Any]], dropped: int) -> Iterator[str]:
+def record_of(
+    summaries: Mapping[str, dict[str, Any]], dropped: int | None, skipped: Mapping[str, str]
+) -> dict[str, str]:
+    """Return what a bag says of its completeness, each value as JSON.
+
+    ``summaries`` are those of the topics' ledgers, ``dropped`` the messages that the disk did not
+    take in time, None where nobody knows, ``skipped`` why a topic was not recorded.
+    """
+    missing = list(shortcomings(summaries, dropped or 0))
+    found: dict[str, Any] = {
+        'whole': not missing,
+        'missing': missing,
+        'dropped': dropped,
+        'skipped_topics': dict(skipped),
+        **summaries,
+    }
+    return {name: json.dumps(value) for name, value in found.items()}
+
+
+def shortcomings(summaries: Mapping[str, dict[str, Any]], dropped: int) -> Iterator[str]:
     """Yield in words what is missing from a record; nothing when it is whole.
 
     A tick may be missing without being lost: a controller does not answer a stale sample. What
@@ -106,3 +129,5 @@ def shortcomings(summaries: dict[str, dict[str, Any]], dropped: int) -> Iterator
         if summary.get('missing_ticks'):
             gaps = ', '.join(f'{a}-{b}' if b > a else f'{a}' for a, b in summary['gaps'])
             yield f'{topic}: {summary["missing_ticks"]} ticks without a message ({gaps})'
+        if summary.get('without_tick'):
+            yield f'{topic}: {summary["without_tick"]} messages too short to carry a tick'
