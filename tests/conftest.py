@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from fam_bundle_bringup.experiment import default_configuration
+from fam_bundle_bringup.experiment import default_configuration, run_experiment
 from fam_bundle_model.parameters import Configuration, load_configuration
 
 # One quick cycle in which every scheme shifts up and down.
 QUICK = {'amplitude': 0.06, 'frequency': 0.25, 'cycles': 1}
 
 
-@pytest.fixture
+@pytest.fixture(scope='session')
 def quick() -> Callable[..., Configuration]:
     """Return a maker of short configurations of the paper's rig."""
 
@@ -26,6 +26,17 @@ def quick() -> Callable[..., Configuration]:
         return load_configuration(default_configuration(), merged)
 
     return make
+
+
+@pytest.fixture(scope='session')
+def recorded_runs(
+    tmp_path_factory: pytest.TempPathFactory, quick: Callable[..., Configuration]
+) -> Path:
+    """Return a folder with two experiments through the graph, each with its bag."""
+    folder = tmp_path_factory.mktemp('runs')
+    for scheme in ('baseline', 'lag_pressure'):
+        run_experiment(quick(scheme), 'lockstep', folder / scheme, record=True)
+    return folder
 
 
 @pytest.fixture

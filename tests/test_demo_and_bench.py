@@ -10,9 +10,11 @@ import pytest
 
 from fam_bundle_bringup import bench, demo, hindsight
 from fam_bundle_bringup.offline import run_offline
+from fam_bundle_io.report_files import write_report
 from fam_bundle_io.shapes import paper_claims
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import SCHEMES, Configuration
+from fam_bundle_model.schema import ConfigurationError
 
 FIGURES = {
     'figure_06_response',
@@ -62,10 +64,29 @@ def test_demo_writes_all_its_results(
     for name in FIGURES:
         assert (tmp_path / f'{name}.png').read_bytes().startswith(b'\x89PNG')
         assert (tmp_path / f'{name}.pdf').read_bytes().startswith(b'%PDF')
+    bags = [tmp_path / scheme / 'bag' for scheme in table]
+    write_report(bags, tmp_path / 'report')
+    report = json.loads((tmp_path / 'report' / 'report.json').read_text())['runs']
+    for scheme, values in table.items():  # to the last digit
+        assert {name: report[scheme][name] for name in values} == values
     printed = capfd.readouterr().out
     for scheme in demo.PAPER:
         assert f'{table[scheme]["iae"]:.4f}' in printed
         assert f'{demo.PAPER[scheme].iae:.4f}' in printed
+
+
+def test_a_demo_takes_only_its_own_bag_away(tmp_path: Path) -> None:
+    bag = tmp_path / 'bag'
+    demo.remove_bag(bag)
+    bag.mkdir()
+    (bag / 'bag_0.mcap').touch()  # of a demo that was killed
+    demo.remove_bag(bag)
+    assert not bag.exists()
+    bag.mkdir()
+    (bag / 'thesis.tex').touch()
+    with pytest.raises(ConfigurationError, match='holds more than the bag of a demo'):
+        demo.remove_bag(bag)
+    assert (bag / 'thesis.tex').exists()
 
 
 def test_bench_measures_every_candidate(

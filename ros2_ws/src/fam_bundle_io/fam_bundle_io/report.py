@@ -112,7 +112,8 @@ def _reported(
         configuration = None
     time, step = trace['time'], steps(trace)
     whole = Window(float(time[0]), float(time[-1] + step[-1]))
-    cycles = [] if 'strain_reference' in run.missing else whole_cycles(trace, configuration)
+    told = configuration is not None or 'strain_reference' not in run.missing
+    cycles = whole_cycles(trace, configuration) if told else []
     warnings += _shortness(cycles, whole, run, configuration)
     lacking = sorted(ENERGETIC & run.missing)
     found = None
@@ -159,11 +160,12 @@ def _shortness(
 
 
 def _doubts(modelled_oil: float) -> list[str]:
-    if abs(modelled_oil - 1.0) <= OIL_MISMATCH:
+    off = modelled_oil - 1.0
+    if abs(off) <= OIL_MISMATCH:
         return []
     return [
-        f'the modelled flow of the units is {modelled_oil - 1.0:+.1%} off the measured one: so '
-        'doubtful are the losses in valves and hoses'
+        f'the modelled flow of the units is {abs(off):.1%} {"above" if off > 0.0 else "below"} '
+        'the measured one: the losses in valves and hoses are that uncertain'
     ]
 
 

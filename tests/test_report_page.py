@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a report, in a real browser without network."""
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fam_bundle_io.metrics import Window
+from fam_bundle_io.report_files import write_report
+
+
+@pytest.fixture(scope='module')
+def report(recorded_runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp('report')
+    bags = [recorded_runs / scheme / 'bag' for scheme in ('baseline', 'lag_pressure')]
+    write_report(bags, folder)
+    return folder
+
+
+@pytest.fixture(scope='module')
+def browser() -> Iterator[Any]:
+    """Give a headless Chromium that resolves no host name."""
+    webdriver = pytest.importorskip('selenium.webdriver')
+    chromium = shutil.which('chromium') or shutil.which('chromium-browser')
+    driver = shutil.which('chromedriver')
+    if not (chromium and driver):
+        pytest.skip('needs chromium and chromedriver: apt install chromium chromium-driver')
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for argument in (
+        '--headless=new',
+        '--no-sandbox',
+        '--disable-gpu',
+        '--disable-dev-shm-usage',
+        '--window-size=1250,1000',
+        '--host-resolver-rules=MAP * ~NOTFOUND',
+    ):
+        options.add_argument(argument)
+    options.set_capability('goog:loggingPrefs', {'browser': 'ALL', 'performance': 'ALL'})
+    service = webdriver.ChromeService(executable_path=driver)
+    found = webdriver.Chrome(options=options, service=service)
+    yield found
+    found.quit()
+
+
+def requested(browser: Any) -> set[str]:
+    """Return the addresses that the page asked for."""
+    found = set()
+    for entry in browser.get_log('performance'):
+        message = json.loads(entry['message'])['message']
+        if message['method'] == 'Network.requestWillBeSent':
+            found.add(message['params']['request']['url'])
+    return found
+
+
+def ranges(browser: Any, plot: Any) -> list[list[float]]:
+    script = """
+        const layout = arguments[0]._fullLayout;
+        return Object.keys(layout).filter(k => /^xaxis\\d*$/.test(k)).map(k => layout[k].range);
+    """
+    return [list(found) for found in browser.execute_script(script, plot)]
+
+
+def test_the_page_works_in_a_browser_without_network(browser: Any, report: Path) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.by import By
+
+    browser.get_log('performance')
+    page = (report / 'report.html').resolve().as_uri()
+    browser.get(page)
+    assert {a for a in requested(browser) if not a.startswith('data:')} == {page}
+    assert [entry for entry in browser.get_log('browser') if entry['level'] == 'SEVERE'] == []
+    plots = browser.find_elements(By.CSS_SELECTOR, '.js-plotly-plot')
+    assert len(plots) == 6  # comparison, energy, two runs, two latencies
+    for plot in plots:
+        drawn = plot.find_elements(By.CSS_SELECTOR, 'path.js-line, .bars path')
+        assert drawn
+        assert any(path.size['width'] > 20 for path in drawn)
+    panels = plots[2]
+    before = ranges(browser, panels)
+    assert len(before) == 6
+    assert all(np.allclose(found, before[0]) for found in before)
+    browser.execute_script('arguments[0].scrollIntoView()', panels)
+    area = panels.find_element(By.CSS_SELECTOR, '.nsewdrag')
+    drag = ActionChains(browser).move_to_element_with_offset(area, -100, 0).click_and_hold()
+    drag.move_by_offset(60, 0).move_by_offset(60, 0).release().perform()
+    after = ranges(browser, panels)
+    assert all(np.allclose(found, after[0]) for found in after)
+    span = Window(*after[0])
+    assert before[0][0] < span.start < span.stop < before[0][1]
+
+
+def test_words_in_a_bag_cannot_become_a_part_of_the_page(
+    browser: Any, recorded_runs: Path, tmp_path: Path
+) -> None:
+    from selenium.webdriver.common.by import By
+
+    name = '<img src=x onerror=alert(1)>'
+    shutil.copytree(recorded_runs / 'baseline' / 'bag', tmp_path / name)
+    write_report([tmp_path / name], tmp_path / 'report')
+    browser.get((tmp_path / 'report' / 'report.html').resolve().as_uri())
+    assert browser.find_elements(By.CSS_SELECTOR, 'img[src=x]') == []
+    assert name in browser.find_element(By.TAG_NAME, 'body').text
