@@ -192,6 +192,13 @@ def run_experiment_command(options: argparse.Namespace, configuration: Configura
         print(f'                {loop["skipped_periods"]} periods skipped, {loop["missing"]} lost')
         for state in loop['states']:
             print(f'                {state}')
+    if options.record:
+        bag = metrics['bag']
+        print(
+            f'  recorded      {bag["messages"]} messages, {"; ".join(bag["missing"]) or "whole"};'
+        )
+        print(f'                recorder: {bag["cpu_share"]:.2f} of a core, ', end='')
+        print(f'{bag["peak_memory"] / 1e6:.0f} MB')
     print(f'written to {options.out}')
 
 

@@ -115,6 +115,25 @@ def loop_of(reports: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
+def bag_of(bag: Path) -> dict[str, Any]:
+    """Return what the recorder says of its bag: whether it is whole, and what recording took."""
+    import yaml
+
+    content = yaml.safe_load((bag / 'metadata.yaml').read_text())
+    said = content['rosbag2_bagfile_information']
+    notes = said['custom_data']
+    cost = {
+        name: float(notes[f'fam_bundle.recorder.{name}'])
+        for name in ('elapsed', 'cpu_time', 'peak_memory')
+    }
+    return {
+        'messages': said['message_count'],
+        'missing': json.loads(notes['fam_bundle.completeness.missing']),
+        'cpu_share': cost['cpu_time'] / cost['elapsed'],
+        'peak_memory': cost['peak_memory'],
+    }
+
+
 def prepare_folder(folder: Path, results: Iterable[str]) -> None:
     """Make ``folder`` and take away ``results`` of an earlier call in it.
 
@@ -162,6 +181,8 @@ def run_experiment(
         metrics = metrics_of(configuration, pace, trace)
     except ValueError as error:
         raise RunFailed(f'no metrics: {error}', trace) from None
+    if record:
+        metrics['bag'] = bag_of(folder / 'bag')
     if pace == 'realtime':
         metrics['loop'] = loop_of(json.loads((folder / 'loop_statistics.json').read_text()))
     write_json(metrics, folder / 'metrics.json')

@@ -6,6 +6,7 @@ import importlib
 import importlib.metadata
 import json
 import platform
+import resource
 import signal
 import sys
 import time
@@ -94,6 +95,7 @@ class BagRecorder(Node):
             self.destroy_node()
             raise
         self._patterns = given['topics']
+        self._began = time.monotonic(), time.process_time()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(LOOK_PERIOD, self.look_for_topics, clock=steady)
 
@@ -220,7 +222,17 @@ class BagRecorder(Node):
     def records(self) -> dict[str, dict[str, str]]:
         """Return the records of metadata that end the bag, by name."""
         found = record_of(self.summaries(), self.writer.dropped, self.skipped)
-        return {'fam_bundle.completeness': found}
+        cost = {name: f'{value:.6g}' for name, value in self.cost().items()}
+        return {'fam_bundle.completeness': found, 'fam_bundle.recorder': cost}
+
+    def cost(self) -> dict[str, float]:
+        """Return what recording took: elapsed and CPU time (s), and the most memory (B)."""
+        elapsed, cpu_time = self._began
+        return {
+            'elapsed': time.monotonic() - elapsed,
+            'cpu_time': time.process_time() - cpu_time,
+            'peak_memory': 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        }
 
 
 def provenance(configuration: Configuration | None) -> dict[str, str]:
@@ -242,6 +254,12 @@ def provenance(configuration: Configuration | None) -> dict[str, str]:
             'scheme': configuration.recruitment.scheme,
             'seed': str(configuration.sensors.seed),
             'period': repr(configuration.simulation.period),
+            'filters': json.dumps(
+                {
+                    name: getattr(configuration.recruitment, name)
+                    for name in ('strain_rate_time_constant', 'force_time_constant')
+                }
+            ),
         }
     return found
 
