@@ -64,10 +64,16 @@ class _Walk:
     def __init__(self, data: bytes, types: Types) -> None:
         self.data, self.types = data, types
         self.at = ENCAPSULATION
-        if len(data) < ENCAPSULATION or data[0] != 0 or data[1] not in (0, 1):
-            raise DamagedError(f'unknown encapsulation {data[:2].hex()}')
-        self.order = '<' if data[1] == 1 else '>'
+        self.order = '<' if data[1:2] == b'\1' else '>'
         self.layout = Layout([], [])
+        self.too_long = -1  # where a length lies that is more than the whole message
+
+    def whole(self, name: str) -> None:
+        if len(self.data) < ENCAPSULATION or self.data[0] != 0 or self.data[1] not in (0, 1):
+            raise DamagedError(f'unknown encapsulation {self.data[:2].hex()}')
+        self.message(name, '')
+        if len(self.data) - self.at > 3:  # writers may fill up to four bytes
+            raise DamagedError(f'{len(self.data)} bytes, {self.at} wanted')
 
     def message(self, name: str, prefix: str) -> None:
         for field, kind in self.types[name][1]:
@@ -105,6 +111,9 @@ class _Walk:
         offset = self.at
         self.take(4)
         value = int(np.frombuffer(self.data, f'{self.order}u4', 1, offset)[0])
+        if value > len(self.data):
+            self.too_long = offset
+            raise DamagedError(f'a length of {value} in {len(self.data)} bytes')
         self.layout.lengths.append((offset, value))
         return value
 
@@ -122,17 +131,19 @@ class _Walk:
             raise DamagedError(f'{len(self.data)} bytes, at least {self.at} wanted')
 
 
-def layout_of(data: bytes, name: str, types: Types) -> Layout:
-    """Return where the fields of the serialized message ``data`` of type ``name`` lie.
-
-    ``types`` is as from ``rosbags.typesys.get_types_from_msg``. Raises NotFlatError for a type
-    that is no row of numbers and texts, and DamagedError for data that is not of it.
-    """
-    walk = _Walk(data, types)
-    walk.message(name, '')
-    if len(data) - walk.at > 3:  # writers may fill up to four bytes
-        raise DamagedError(f'{len(data)} bytes, {walk.at} wanted')
-    return walk.layout
+def types_within(name: str, types: Types) -> set[str]:
+    """Return the names of the message type ``name`` and of all that it is made of."""
+    found, waiting = set[str](), [name]
+    while waiting:
+        name = waiting.pop()
+        if name in found:
+            continue
+        found.add(name)
+        for _, kind in types[name][1] if name in types else ():
+            element = kind[1][0] if kind[0] in (ARRAY, SEQUENCE) else kind
+            if element[0] == NAME:
+                waiting.append(element[1])
+    return found
 
 
 class Part(NamedTuple):
@@ -145,26 +156,29 @@ class Part(NamedTuple):
 def decode(messages: np.ndarray, name: str, types: Types) -> Iterator[Part]:
     """Yield all messages, those of one layout together.
 
-    ``messages`` is a (n, size) array of bytes. Raises NotFlatError. A message that is damaged
-    comes alone and without columns.
+    ``messages`` is a (n, size) array of bytes, ``types`` is as from
+    ``rosbags.typesys.get_types_from_msg``. Messages that are damaged come without columns. Raises
+    NotFlatError for a type that is no row of numbers and texts.
     """
     left = np.arange(len(messages))
     while len(left):
-        first = messages[left[0]].tobytes()
+        walk = _Walk(messages[left[0]].tobytes(), types)
+        damaged = False
         try:
-            layout = layout_of(first, name, types)
-        except DamagedError:
-            yield Part(left[:1], {})
-            left = left[1:]
-            continue
+            walk.whole(name)
+        except DamagedError:  # so are all with the lengths that were met until then
+            damaged = True
         same = np.all(messages[left, :2] == messages[left[0], :2], axis=1)
-        for offset, _ in layout.lengths:
+        for offset, _ in walk.layout.lengths:
             field = slice(offset, offset + 4)
             same &= np.all(messages[left, field] == messages[left[0], field], axis=1)
+        if walk.too_long >= 0:
+            field = slice(walk.too_long, walk.too_long + 4)
+            lengths = np.ascontiguousarray(messages[left, field]).view(f'{walk.order}u4')
+            same &= lengths[:, 0] > messages.shape[1]
         rows = left[same]
-        yield Part(
-            rows, _columns(messages if len(rows) == len(messages) else messages[rows], layout)
-        )
+        alike = messages if len(rows) == len(messages) else messages[rows]
+        yield Part(rows, {} if damaged else _columns(alike, walk.layout))
         left = left[~same]
 
 
