@@ -253,7 +253,8 @@ def test_command_line_options() -> None:
     known: dict[str, set[str]] = {}
     for command, options in commands.choices.items():
         for action in options._actions:
-            known.setdefault(action.option_strings[-1], set()).add(command)
+            for name in action.option_strings[-1:]:  # none: a bag
+                known.setdefault(name, set()).add(command)
     del known['--help']
     rows = cells(readme('fam_bundle_bringup'), '## Options')
     assert {row[0]: set(row[1].split(', ')) for row in rows} == known
