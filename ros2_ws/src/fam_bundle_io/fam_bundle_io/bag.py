@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reads any bag of a bundle's topics into tables; needs no ROS.
 
-MCAP or SQLite, whole or cut short, as ``bag_recorder`` and ``rosbags`` write them; compressed bags
-and those of ``ros2 bag record`` follow the same format and have not been tried. What could not be
-read is said in ``Bag.warnings``.
+MCAP or SQLite, compressed or not, whole or cut short, as ``bag_recorder``, ``ros2 bag record`` and
+``rosbags`` write them. What could not be read is said in ``Bag.warnings``.
 """
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 TIMES = ('received', 'published')  # columns of every table: system time, ns
+LATE = 100  # ticks that a message may be late among others
+LONGEST_ANSWER = 10_000_000_000  # ns after its sample; beyond it belongs to another run
 BATCH = 16 * 1024 * 1024  # bytes of a topic that are decoded at once
 STATE = 'fam_bundle_msgs/msg/BundleState'
 LOOP = {
@@ -119,9 +121,11 @@ class _Collector:
             try:
                 self._store.register(get_types_from_msg(first.definition, first.type))
             except Exception as error:  # whatever a damaged definition makes of the parser
-                raise BagError(f'{self.topic}: definition of {first.type}: {error}') from None
-        if self.type not in self._store.fielddefs:
-            raise BagError(f'{self.topic}: the bag does not define its type {self.type}')
+                why = f'{error}'.partition('\n')[0]
+                raise BagError(f'{self.topic}: definition of {first.type}: {why}') from None
+        for name in cdr.types_within(self.type, self._store.fielddefs):
+            if name not in self._store.fielddefs:
+                raise BagError(f'{self.topic}: the bag does not define its type {name}')
         self._waiting: dict[int, list[Messages]] = {}
         self._size, self._damaged = 0, 0
         self._parts: dict[tuple[str, ...], list[tuple[np.ndarray, dict[str, np.ndarray]]]] = {}
@@ -191,8 +195,10 @@ def _joined(parts: list[np.ndarray]) -> Any:
     if values.dtype.kind != 'S':
         return values
     texts, codes = np.unique(values, return_inverse=True)
-    names = [text.decode(errors='replace') for text in texts.tolist()]
-    return pd.Categorical.from_codes(codes, pd.Index(names))
+    # Damaged texts may be the same once they are decoded.
+    decoded = [text.decode(errors='replace') for text in texts.tolist()]
+    names, numbers = np.unique(decoded, return_inverse=True)
+    return pd.Categorical.from_codes(numbers[codes], pd.Index(names.tolist()))
 
 
 # ---- One run of the loop ----
@@ -234,47 +240,141 @@ def trace_of(bag: Bag, namespace: str = '', run: int = -1) -> Run:
 
     A topic that the bag misses leaves NaN. Raises BagError without ``bundle_state``.
     """
-    tables, warnings = {}, []
-    for name, short in LOOP.items():
-        table = bag.tables.get(f'{namespace}/{short}')
-        if table is None or 'tick' not in table:
-            warnings.append(f'{namespace}/{short}: not in the bag')
-            continue
-        tables[name] = one_run(table, run)
-    if STATE not in tables:
-        raise BagError(f'{namespace}/{LOOP[STATE]}: not in the bag, without which there is no run')
-    ticks = sorted(set.intersection(*(set(table.index) for table in tables.values())))
-    if not ticks:
+    tables, warnings = run_tables(bag, namespace, run)
+    ticks = functools.reduce(np.intersect1d, (table.index for table in tables.values()))
+    if not len(ticks):
         raise BagError('no tick is on every topic of the loop')
+    first, last = int(ticks[0]), int(ticks[-1])
     for name, table in tables.items():
-        lost = ticks[-1] - ticks[0] + 1 - len(ticks)
         if len(table) > len(ticks):
             warnings.append(f'{LOOP[name]}: {len(table) - len(ticks)} ticks have no partner')
-    if lost:
+    if first:
+        warnings.append(f'the run begins with tick {first}')
+    if last - first + 1 > len(ticks):
+        lost = last - first + 1 - len(ticks)
         warnings.append(f'{lost} ticks between the first and the last are missing')
     units = sum(column.startswith('mu_pressure[') for column in tables[STATE])
     trace = empty_trace(len(ticks), units)
     for values in trace.values():
         values.fill(0 if values.dtype.kind == 'i' else np.nan)
-    for name, table in tables.items():
-        rows = table.loc[ticks]
-        if name == STATE:
-            stamps = rows['header.stamp.sec'].to_numpy(np.int64) * 1_000_000_000
-            trace['time'][:] = seconds(stamps + rows['header.stamp.nanosec'].to_numpy(np.int64))
-        for signal, column in COLUMNS[name].items():
-            if trace[signal].ndim == 2:
-                for unit in range(units):
-                    trace[signal][:, unit] = rows[f'{column}[{unit}]']
-            else:
-                trace[signal][:] = rows[column]
     missing = {s for name in COLUMNS if name not in tables for s in COLUMNS[name]}
+    for name, table in tables.items():
+        rows = _Rows(table, table.index.get_indexer(ticks))
+        if name == STATE:
+            stamps = [rows.column(f'header.stamp.{part}') for part in ('sec', 'nanosec')]
+            if any(part is None or part.dtype.kind not in 'iu' for part in stamps):
+                missing.add('time')
+            else:
+                sec, nanosec = (part.astype(np.int64) for part in stamps)
+                trace['time'][:] = seconds(sec * 1_000_000_000 + nanosec)
+        for signal, column in COLUMNS[name].items():
+            if not rows.fill(trace[signal], column):
+                missing.add(signal)
+    for name, signals in COLUMNS.items():
+        if name in tables:
+            warnings += [f'{LOOP[name]}: has no {signals[s]}' for s in signals if s in missing]
     return Run(trace, warnings, frozenset(missing))
 
 
+class _Rows(NamedTuple):
+    """Some rows of a table, by their places."""
+
+    table: 'pd.DataFrame'
+    places: np.ndarray
+
+    def column(self, name: str) -> Any:
+        """Return the numbers of a column, None where it holds none."""
+        if name not in self.table:
+            return None
+        values = self.table[name].to_numpy()
+        return values[self.places] if values.dtype.kind in 'biuf' else None
+
+    def fill(self, values: np.ndarray, name: str) -> bool:
+        """Fill ``values`` with a column, or with those of an array; False where it is missing."""
+        names = [f'{name}[{unit}]' for unit in range(values.shape[1])] if values.ndim == 2 else []
+        columns = [self.column(name) for name in names or [name]]
+        whole = values.dtype.kind == 'i'
+        if any(c is None or (whole and c.dtype.kind not in 'iu') for c in columns):
+            return False
+        values[:] = np.stack(columns, axis=-1) if names else columns[0]
+        return True
+
+
+def run_tables(
+    bag: Bag, namespace: str = '', run: int = -1
+) -> 'tuple[dict[str, pd.DataFrame], list[str]]':
+    """Return the rows of one run by tick, for each message type of the loop, and warnings.
+
+    What answers the samples of the plant belongs to their run. Raises BagError without them.
+    """
+    found, warnings = {}, []
+    for name, short in LOOP.items():
+        topic = f'{namespace}/{short}'
+        table = bag.tables.get(topic)
+        if table is None:
+            warnings.append(f'{topic}: not in the bag')
+        elif bag.types[topic] != name:
+            warnings.append(f'{topic}: is of type {bag.types[topic]}, not {name}')
+        elif 'tick' not in table or table['tick'].dtype.kind not in 'iu':
+            warnings.append(f'{topic}: its messages carry no tick')
+        else:
+            found[name] = table
+    if STATE not in found:
+        topic = f'{namespace}/{LOOP[STATE]}'
+        why = [words for words in warnings if words.startswith(f'{topic}: ')]
+        raise BagError(f'{why[0]}, without which there is no run')
+    state = found[STATE]
+    runs = runs_of(state)
+    wanted = run if run >= 0 else runs[-1] + 1 + run
+    rows = {STATE: state[runs == wanted]}
+    for name in set(found) - {STATE}:
+        rows[name] = _answers(found[name], state, runs, wanted)
+    tables = {}
+    for name in found:
+        tables[name] = rows[name].drop_duplicates('tick').set_index('tick')
+        repeated = len(rows[name]) - len(tables[name])
+        if repeated:
+            warnings.append(f'{LOOP[name]}: {repeated} messages repeat a tick')
+    return tables, warnings
+
+
+def runs_of(table: 'pd.DataFrame') -> np.ndarray:
+    """Return for each row the number of its run, counted from 0.
+
+    A run begins at tick 0; where that is lost, ticks fall back by more than some that were late.
+    """
+    ticks = table['tick'].to_numpy().astype(np.int64)
+    begins = np.zeros(len(ticks), dtype=bool)
+    begins[1:] = (ticks[1:] == 0) & (ticks[:-1] != 0)
+    begins[1:] |= ticks[1:] < ticks[:-1] - LATE
+    return np.asarray(np.cumsum(begins))
+
+
+def _answers(
+    table: 'pd.DataFrame', state: 'pd.DataFrame', runs: np.ndarray, wanted: int
+) -> 'pd.DataFrame':
+    """Return the answers to the samples of one run: those nearest in time of the same tick."""
+    import pandas as pd
+
+    if runs[-1] == 0:
+        return table if wanted == 0 else table[:0]
+    samples = state[['tick', 'published']].assign(run=runs).sort_values('published')
+    answers = table[['tick', 'published']].sort_values('published')
+    samples['tick'], answers['tick'] = samples['tick'].astype('u8'), answers['tick'].astype('u8')
+    nearest = pd.merge_asof(
+        answers,
+        samples,
+        on='published',
+        by='tick',
+        direction='nearest',
+        tolerance=LONGEST_ANSWER,
+    )
+    places = answers.index[(nearest['run'] == wanted).to_numpy()]
+    return table.loc[places.sort_values()]
+
+
 def one_run(table: 'pd.DataFrame', run: int) -> 'pd.DataFrame':
-    """Return the rows of one run by tick, each at its first coming; tick 0 begins a run."""
-    begins = table['tick'] == 0
-    numbers = (begins & ~begins.shift(fill_value=False)).cumsum()
-    wanted = numbers.max() if run < 0 else numbers.min() + run
-    rows = table[numbers == wanted]
+    """Return the rows of one run by tick, each at its first coming."""
+    runs = runs_of(table)
+    rows = table[runs == (run if run >= 0 else runs[-1] + 1 + run)]
     return rows.drop_duplicates('tick').set_index('tick')

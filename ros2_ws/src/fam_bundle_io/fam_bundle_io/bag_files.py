@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The files of a bag, and the serialized messages in them as far as they can be read.
 
-MCAP is read chunk by chunk with the ``mcap`` package, so that a file without its end gives all
-that is whole; SQLite and compressed files through ``rosbags``.
+Each file is read by itself: one without its end, or without ``metadata.yaml``, gives all that is
+whole. MCAP is read chunk by chunk with the ``mcap`` package, SQLite with Python's own. Either may
+be compressed with zstd, the whole file or each message.
 """
 
+import contextlib
 import sqlite3
 import struct
+import tempfile
 from collections.abc import Iterator, Mapping
 from io import BytesIO
 from pathlib import Path
@@ -34,7 +37,10 @@ MESSAGE_HEAD = np.dtype(
     ]
 )
 CHANNEL_NUMBER = struct.Struct('<H')
-BATCH = 50_000  # messages
+LOOSE = 1 << 20  # bytes of messages outside of chunks that are taken together
+BATCH = 50_000  # messages that are taken together out of a database
+# What files begin with; a message in CDR begins with 0.
+ZSTD, SQLITE = b'\x28\xb5\x2f\xfd', b'SQLite format 3\0'
 
 
 class Messages(NamedTuple):
@@ -64,43 +70,115 @@ def read_parts(path: Path) -> Iterator[Messages | Records | Damage]:
 
     Raises BagError when there is no bag.
     """
-    information, files = _found(path)
-    if not information and path.is_dir():
+    files, described = _files_of(path)
+    if not described:
         yield Damage('metadata.yaml is missing or damaged')
+    count, told = 0, set[str]()
     for file in files:
         if not file.is_file():
             yield Damage(f'{file.name} is missing')
-    files = [file for file in files if file.is_file()]
-    compressed = str(information.get('compression_mode') or 'none').lower() != 'none'
-    if compressed or any(file.suffix != '.mcap' for file in files):
-        yield from _read_with_rosbags(path if path.is_dir() else path.parent)
-        return
-    count = 0
-    for file in files:
-        mcap = _Mcap(file, count)
-        yield from mcap.read()
-        count = mcap.count
+            continue
+        for part in _read_file(file, count):
+            if isinstance(part, Messages):
+                count = max(count, int(part.numbers[-1]) + 1)
+            elif isinstance(part, Damage):
+                if part.words in told:
+                    continue
+                told.add(part.words)
+            yield part
 
 
-def _found(path: Path) -> tuple[dict[str, Any], list[Path]]:
-    """Return what metadata.yaml says, nothing if it cannot be read, and the files of the bag."""
+def _files_of(path: Path) -> tuple[list[Path], bool]:
+    """Return the files of the bag, and False if its folder does not describe them."""
     if path.is_file():
-        return {}, [path]
+        return [path], True
     if not path.is_dir():
         raise BagError(f'{path}: no such bag')
     try:
         found = yaml.safe_load((path / 'metadata.yaml').read_text())
-        information = dict(found['rosbag2_bagfile_information'])
-        files = [path / Path(str(name)).name for name in information['relative_file_paths']]
+        names = found['rosbag2_bagfile_information']['relative_file_paths']
+        files = [path / Path(str(name)).name for name in names]
     except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
-        information, files = {}, []
+        files = []
+    described = bool(files)
     files = files or sorted(p for p in path.iterdir() if {'.mcap', '.db3'} & set(p.suffixes))
     if not files:
         raise BagError(f'{path}: holds no .mcap and no .db3 file')
-    return information, files
+    return files, described
+
+
+def _read_file(file: Path, first: int) -> Iterator[Messages | Records | Damage]:
+    """Yield what is in a file; its messages are numbered from ``first``."""
+    with tempfile.TemporaryDirectory() as folder:
+        plain = file
+        if _begins_with(file, ZSTD):
+            plain = Path(folder, file.stem)
+            yield from _decompress(file, plain)
+        storage = _read_sqlite if _begins_with(plain, SQLITE) else _read_mcap
+        for part in storage(plain, first):
+            if isinstance(part, Messages) and part.data[0, : len(ZSTD)].tobytes() == ZSTD:
+                yield from _decompressed(part)
+            else:
+                yield part
+
+
+def _begins_with(file: Path, mark: bytes) -> bool:
+    with file.open('rb') as stream:
+        return stream.read(len(mark)) == mark
+
+
+def _short(error: Exception) -> str:
+    return f'{type(error).__name__} {error}'.strip().partition('\n')[0][:120]
+
+
+# ---- Compression ----
+
+
+def _decompress(file: Path, plain: Path) -> Iterator[Damage]:
+    import zstandard
+
+    with file.open('rb') as source, plain.open('wb') as target:
+        try:
+            zstandard.ZstdDecompressor().copy_stream(source, target)
+        except (zstandard.ZstdError, OSError) as error:
+            yield Damage(f'{file.name}: cut short: {_short(error)}')
+
+
+def _decompressed(messages: Messages) -> Iterator[Messages | Damage]:
+    """Yield messages that were compressed one by one as what they were."""
+    import zstandard
+
+    decompress = zstandard.ZstdDecompressor().decompress
+    sizes: dict[int, list[tuple[int, bytes]]] = {}
+    for row, compressed in enumerate(messages.data):
+        with contextlib.suppress(zstandard.ZstdError, MemoryError):  # counted below
+            data = decompress(compressed.tobytes())
+            sizes.setdefault(len(data), []).append((row, data))
+    whole = 0
+    for found in sizes.values():
+        whole += len(found)
+        rows = np.array([row for row, _ in found])
+        yield messages._replace(
+            numbers=messages.numbers[rows],
+            received=messages.received[rows],
+            published=messages.published[rows],
+            data=_rows([data for _, data in found]),
+        )
+    if whole < len(messages.data):
+        lost = len(messages.data) - whole
+        yield Damage(f'{messages.topic}: {lost} messages cannot be decompressed')
+
+
+def _rows(data: list[bytes]) -> np.ndarray:
+    """Return messages of one size as the rows of an array."""
+    return np.frombuffer(b''.join(data), 'u1').reshape(len(data), -1 if data[0] else 0)
 
 
 # ---- MCAP ----
+
+
+def _read_mcap(file: Path, first: int) -> Iterator[Messages | Records | Damage]:
+    return _Mcap(file, first).read()
 
 
 class _Mcap:
@@ -113,8 +191,7 @@ class _Mcap:
 
     def read(self) -> Iterator[Messages | Records | Damage]:
         """Yield what is in the file until its end, or until it cannot be read any further."""
-        from mcap.exceptions import McapError
-        from mcap.records import Channel, Chunk, Message, Metadata, Schema
+        from mcap.records import Channel, Chunk, Metadata, Schema
 
         begin = self.count
         with self.path.open('rb') as file:
@@ -126,9 +203,7 @@ class _Mcap:
                         yield {record.name: dict(record.metadata)}
                     elif isinstance(record, Chunk):
                         yield from self.whole_parts(record)
-                    elif isinstance(record, Message):
-                        yield Damage(f'{self.path.name}: a message outside a chunk is not read')
-            except (McapError, ValueError, OSError, EOFError, struct.error) as error:
+            except Exception as error:  # of whatever damaged bytes make of the readers
                 after = f'after {self.count - begin} messages'
                 yield Damage(f'{self.path.name}: cut short {after}: {_short(error)}')
 
@@ -185,7 +260,7 @@ class _Mcap:
             return Damage(f'{self.path.name}: {len(starts)} messages of an unknown channel')
         if channel.message_encoding != 'cdr' or schema.encoding != 'ros2msg':
             encoding = f'{channel.message_encoding}, {schema.encoding}'
-            return Damage(f'{channel.topic}: {len(starts)} messages in {encoding}: not read')
+            return Damage(f'{channel.topic}: messages in {encoding} are not read')
         whole = raw[starts[:, None] + np.arange(HEAD.size + length)]
         heads = np.ascontiguousarray(whole[:, : MESSAGE_HEAD.itemsize]).view(MESSAGE_HEAD)[:, 0]
         return Messages(
@@ -199,10 +274,6 @@ class _Mcap:
         )
 
 
-def _short(error: Exception) -> str:
-    return f'{type(error).__name__} {error}'.strip()[:120]
-
-
 def _data_of(chunk: Any) -> bytes:
     from mcap.stream_reader import get_chunk_data_stream
 
@@ -213,10 +284,13 @@ def _data_of(chunk: Any) -> bytes:
 
 
 def _records(file: BinaryIO) -> Iterator[Any]:
-    """Yield the records of a file that matter here, until the index that ends it."""
+    """Yield the records of a file that matter here, until the index that ends it.
+
+    Messages outside of chunks come as chunks, many in each.
+    """
     from mcap.data_stream import ReadDataStream
     from mcap.opcode import Opcode
-    from mcap.records import Channel, Chunk, Message, Metadata, Schema
+    from mcap.records import Channel, Chunk, Metadata, Schema
     from mcap.stream_reader import read_magic
 
     readers: Mapping[int, Any] = {
@@ -225,61 +299,134 @@ def _records(file: BinaryIO) -> Iterator[Any]:
         Opcode.CHUNK: Chunk.read,
         Opcode.METADATA: Metadata.read,
     }
-    stream = ReadDataStream(file)
+    stream, loose, opcode = ReadDataStream(file), bytearray(), 0
     read_magic(stream)
-    while True:
-        opcode, length = HEAD.unpack(stream.read(HEAD.size))
-        if length > LARGEST_RECORD:
-            raise ValueError(f'a record says that it has {length} bytes')
-        if opcode == Opcode.DATA_END:
-            return
-        if opcode == Opcode.MESSAGE:
-            yield Message.read(stream, length)
-        elif opcode in readers:
-            end = file.tell() + length
-            yield readers[opcode](stream)
-            file.seek(end)
-        else:
-            file.seek(length, 1)
-
-
-# ---- All other storage ----
-
-
-Waiting = dict[tuple[int, int], list[tuple[int, int, bytes]]]  # by connection and size
-
-
-def _read_with_rosbags(folder: Path) -> Iterator[Messages | Damage]:
-    from rosbags.rosbag2 import Reader, ReaderError
-
-    count, waiting = 0, Waiting()
-    connections: dict[int, Any] = {}
     try:
-        with Reader(folder) as reader:
-            for connection, received, data in reader.messages():
-                connections[connection.id] = connection
-                found = waiting.setdefault((connection.id, len(data)), [])
-                found.append((count, received, bytes(data)))
-                count += 1
-                if count % BATCH == 0:
-                    yield from _taken(waiting, connections)
-    except (ReaderError, ValueError, OSError, KeyError, TypeError, sqlite3.Error) as error:
-        yield Damage(f'{folder.name}: cut short after {count} messages: {_short(error)}')
-    yield from _taken(waiting, connections)
+        while opcode != Opcode.DATA_END:
+            head = _exactly(file, HEAD.size)
+            opcode, length = HEAD.unpack(head)
+            if length > LARGEST_RECORD:
+                raise ValueError(f'a record says that it has {length} bytes')
+            if opcode == Opcode.MESSAGE:
+                loose += head + _exactly(file, length)
+            if loose and (opcode != Opcode.MESSAGE or len(loose) > LOOSE):
+                yield _chunk_of(loose)
+                loose = bytearray()
+            if opcode in readers:
+                end = file.tell() + length
+                yield readers[opcode](stream)
+                file.seek(end)
+            elif opcode != Opcode.MESSAGE:
+                file.seek(length, 1)
+    except Exception:
+        if loose:
+            yield _chunk_of(loose)
+        raise
 
 
-def _taken(waiting: Waiting, connections: Mapping[int, Any]) -> Iterator[Messages]:
-    for (identity, size), found in waiting.items():
-        connection = connections[identity]
-        numbers, received, data = zip(*found, strict=True)
-        times = np.array(received, dtype=np.int64)
-        yield Messages(
-            connection.topic,
-            connection.msgtype,
-            connection.msgdef.data,
-            np.array(numbers),
-            times,
-            times,
-            np.frombuffer(b''.join(data), 'u1').reshape(-1, size),
+def _exactly(file: BinaryIO, size: int) -> bytes:
+    data = file.read(size)
+    if len(data) < size:
+        raise EOFError('the file ends within a record')
+    return data
+
+
+def _chunk_of(records: bytearray) -> Any:
+    from mcap.records import Chunk
+
+    return Chunk(
+        compression='',
+        data=bytes(records),
+        message_end_time=0,
+        message_start_time=0,
+        uncompressed_crc=0,
+        uncompressed_size=len(records),
+    )
+
+
+# ---- SQLite ----
+
+
+class _Topic(NamedTuple):
+    name: str
+    type: str
+    format: str
+    definition: str
+
+
+Row = tuple[int, int, bytes]  # number of the topic, time, message
+
+
+def _read_sqlite(file: Path, first: int) -> Iterator[Messages | Damage]:
+    begin, rows, damage = first, list[Row](), []
+    try:
+        with contextlib.closing(_database(file)) as database:
+            topics = _topics(database)
+            for row in database.execute('SELECT topic_id, timestamp, data FROM messages'):
+                rows.append(row)
+                if len(rows) == BATCH:
+                    yield from _messages(rows, topics, first)
+                    first, rows = first + BATCH, []
+    except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
+        after = f'after {first + len(rows) - begin} messages'
+        damage.append(Damage(f'{file.name}: cut short {after}: {_short(error)}'))
+    if rows:
+        yield from _messages(rows, topics, first)
+    yield from damage
+
+
+def _database(file: Path) -> sqlite3.Connection:
+    # SQLite makes files beside a database unless it can trust that nobody writes it; what a
+    # recording that crashed did not bring into its database is in such a file.
+    unfinished = file.with_name(f'{file.name}-wal').exists()
+    mode = 'mode=ro' if unfinished else 'immutable=1'
+    return sqlite3.connect(f'{file.absolute().as_uri()}?{mode}', uri=True)
+
+
+def _topics(database: sqlite3.Connection) -> dict[int, _Topic]:
+    """Return the topics of a database by their number."""
+    tables = database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+    definitions = {}
+    if ('message_definitions',) in tables.fetchall():  # not before ROS 2 Iron
+        definitions = dict(
+            database.execute(
+                'SELECT topic_type, encoded_message_definition FROM message_definitions'
+                " WHERE encoding = 'ros2msg'"
+            )
         )
-    waiting.clear()
+    rows = database.execute('SELECT id, name, type, serialization_format FROM topics')
+    return {
+        number: _Topic(f'{name}', f'{kind}', f'{form}', f'{definitions.get(kind, "")}')
+        for number, name, kind, form in rows
+    }
+
+
+def _messages(
+    rows: list[Row], topics: Mapping[int, _Topic], first: int
+) -> Iterator[Messages | Damage]:
+    """Yield rows of a database by topic and size."""
+    groups: dict[tuple[int, int], list[tuple[int, int, bytes]]] = {}
+    damaged = 0
+    for number, (identity, received, data) in enumerate(rows, first):
+        # A damaged database has values of other types.
+        if identity in topics and isinstance(received, int) and isinstance(data, bytes):
+            groups.setdefault((identity, len(data)), []).append((number, received, data))
+        else:
+            damaged += 1
+    if damaged:
+        yield Damage(f'{damaged} rows of the database are damaged')
+    for (identity, _), found in groups.items():
+        topic = topics[identity]
+        if topic.format != 'cdr':
+            yield Damage(f'{topic.name}: messages in {topic.format} are not read')
+            continue
+        times = np.array([received for _, received, _ in found], dtype=np.int64)
+        yield Messages(
+            topic.name,
+            topic.type,
+            topic.definition,
+            np.array([number for number, _, _ in found]),
+            times,
+            times,
+            _rows([data for _, _, data in found]),
+        )
