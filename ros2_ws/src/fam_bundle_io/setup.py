@@ -10,7 +10,7 @@ setup(
     maintainer='fam_bundle maintainers',
     maintainer_email='maintainers@fam-bundle.example',
     license='Apache-2.0',
-    packages=[package],
+    packages=[package, f'{package}.hardware'],
     package_data={package: ['py.typed', '*.mplstyle']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package}']),
@@ -21,5 +21,10 @@ setup(
     zip_safe=False,
     entry_points={
         'console_scripts': ['bag_recorder = fam_bundle_io.bag_recorder_node:main'],
+        'fam_bundle.backends': [
+            'mock = fam_bundle_io.hardware.mock_backend:MockBackend',
+            'nidaqmx = fam_bundle_io.hardware.nidaqmx_backend:NidaqmxBackend',
+            'quanser = fam_bundle_io.hardware.quanser_backend:QuanserBackend',
+        ],
     },
 )

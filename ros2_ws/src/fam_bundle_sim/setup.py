@@ -23,5 +23,8 @@ setup(
         'console_scripts': [
             'plant_simulator = fam_bundle_sim.plant_simulator_node:main',
         ],
+        'fam_bundle.backends': [
+            'volts = fam_bundle_sim.volts_backend:VoltsBackend',
+        ],
     },
 )

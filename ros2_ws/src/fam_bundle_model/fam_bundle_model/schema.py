@@ -2,8 +2,8 @@
 """How a parameter is declared: type, unit, range and one sentence, stated once.
 
 A group is a frozen dataclass whose fields are made by ``number``, ``integer``, ``choice``,
-``flag`` or ``per_unit``. Validation, the YAML loader, ROS parameter descriptors and the reference
-page all read the same declaration.
+``flag``, ``word`` or ``per_unit``. Validation, the YAML loader, ROS parameter descriptors and the
+reference page all read the same declaration.
 """
 
 import dataclasses
@@ -43,6 +43,8 @@ class Declaration:
             return 'must be one of ' + ', '.join(self.choices)
         if self.kind is bool:
             return 'must be true or false'
+        if self.kind is str:
+            return 'must be text that is not blank'
         bounds = []
         if self.minimum > -math.inf:
             bounds.append(f'{">" if self.exclusive else ">="} {self._plain(self.minimum)}')
@@ -72,6 +74,10 @@ class Declaration:
             return value
         if self.kind is bool:
             if not isinstance(value, bool):
+                raise refused
+            return value
+        if self.kind is str:
+            if not isinstance(value, str) or not value.strip():
                 raise refused
             return value
         try:
@@ -112,6 +118,11 @@ def integer(text: str, minimum: int, maximum: int, *, default: int | None = None
 def choice(text: str, choices: tuple[str, ...], *, default: str | None = None) -> Any:
     """Declare one word out of ``choices``."""
     return _field(Declaration(str, '', text, choices=choices), default)
+
+
+def word(text: str, *, default: str | None = None) -> Any:
+    """Declare free text that is not blank."""
+    return _field(Declaration(str, '', text), default)
 
 
 def flag(text: str, *, default: bool) -> Any:

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The hardware bridge without ROS: cards behind one protocol, calibration, limits, safety."""
