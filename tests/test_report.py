@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fam_bundle_io.bag import read_bag
+from fam_bundle_io.bag import read_bag, trace_of
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_io.report import names_of
 from fam_bundle_io.report_files import write_report
 from fam_bundle_io.report_page import extremes
-from fam_bundle_io.timing import timing
+from fam_bundle_io.timing import applied_spool, phases, timing
 from fam_bundle_io.trace import load_trace
 from fam_bundle_model.parameters import Configuration
 
@@ -93,7 +93,11 @@ def test_all_figures_are_there(report: Path) -> None:
 
 def test_answers_come_after_their_samples_and_before_the_next(runs: Path) -> None:
     """In lock-step the valve command of each tick lies between two samples."""
-    found = timing(read_bag(runs / 'baseline' / 'bag'))
+    bag = read_bag(runs / 'baseline' / 'bag')
+    run = trace_of(bag)
+    assert np.array_equal(applied_spool(bag, run), run.trace['spool'])
+    found = timing(bag, run)
+    assert not found.safe.any()
     command, interval = found.answers['valve_command'], found.interval
     assert len(command) == found.samples == len(interval) + 1
     assert (command > 0.0).all()
@@ -234,6 +238,11 @@ def test_names_tell_bags_apart(tmp_path: Path) -> None:
     paths = [tmp_path / name for name in ('a/x/bag', 'b/x/bag', 'b/y.mcap')]
     assert names_of(paths) == ['a/x', 'b/x', 'b/y.mcap']
     assert names_of([tmp_path / 'runs/one/bag', tmp_path / 'two']) == ['one', 'two']
+
+
+def test_phases_are_told_by_their_ends() -> None:
+    assert phases(np.array([True, False, True, True])) == [(0, 0), (2, 3)]
+    assert phases(np.array([False, False])) == []
 
 
 def test_extremes_keep_every_peak() -> None:

@@ -7,14 +7,17 @@ MCAP or SQLite, compressed or not, whole or cut short, as ``bag_recorder``, ``ro
 
 import contextlib
 import functools
-from collections.abc import Callable, Iterable
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from fam_bundle_io import cdr
-from fam_bundle_io.bag_files import Damage, Messages, read_parts
+from fam_bundle_io.bag_files import read_parts
+from fam_bundle_io.bag_parts import Damage, Doubt, Messages
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_io.trace import Trace, empty_trace
 from fam_bundle_model.parameters import (
@@ -31,6 +34,7 @@ TIMES = ('received', 'published')  # columns of every table: system time, ns
 LATE = 100  # ticks that a message may be late among others
 LONGEST_ANSWER = 10_000_000_000  # ns after its sample; beyond it belongs to another run
 BATCH = 16 * 1024 * 1024  # bytes of a topic that are decoded at once
+HASH = 'RIHS01_[0-9a-f]{64}'  # of a definition, as ROS 2 makes it
 STATE = 'fam_bundle_msgs/msg/BundleState'
 LOOP = {
     STATE: 'bundle_state',
@@ -84,28 +88,45 @@ def read_bag(path: Path, topics: Callable[[str], bool] = lambda name: True) -> B
     unreadable: set[str] = set()
     records: dict[str, dict[str, str]] = {}
     for part in read_parts(path):
-        if isinstance(part, Damage):
+        if isinstance(part, Damage | Doubt):
             warnings.append(part.words)
-        elif isinstance(part, Messages):
-            if not topics(part.topic) or part.topic in unreadable:
-                continue
-            types[part.topic] = part.type
-            try:
-                if part.topic not in collectors:
-                    collectors[part.topic] = _Collector(part)
-                collectors[part.topic].add(part)
-            except BagError as error:
-                unreadable.add(part.topic)
-                warnings.append(f'{error}')
-        else:
+        elif isinstance(part, dict):
             records |= part
+        else:
+            for messages in part:
+                name = messages.topic
+                if not topics(name) or name in unreadable:
+                    continue
+                types.setdefault(name, messages.type)
+                try:
+                    if name not in collectors:
+                        collectors[name] = _Collector(messages)
+                    collectors[name].add(messages)
+                except BagError as error:
+                    unreadable.add(name)
+                    collectors.pop(name, None)
+                    warnings.append(f'{error}')
     tables = {}
     for name, collector in collectors.items():
-        tables[name] = collector.table()
+        try:
+            tables[name] = collector.table()
+        except BagError as error:
+            warnings.append(f'{error}')
         warnings += collector.warnings
+    warnings += _recovered(records.get('fam_bundle.recovery'))
     if not tables:
         raise BagError('; '.join([f'{path}: no messages', *warnings]))
     return Bag(tables, types, records, warnings)
+
+
+def _recovered(record: dict[str, str] | None) -> Iterator[str]:
+    """Yield what a bag says of its recovery from a damaged one, nothing of any other."""
+    if record is not None:
+        try:
+            words = [str(words) for words in json.loads(record['damage'])]
+        except (ValueError, TypeError, KeyError):
+            words = ['what was lost cannot be read']
+        yield '; '.join([f'recovered: from {record.get("source", "a damaged bag")}', *words])
 
 
 class _Collector:
@@ -114,7 +135,7 @@ class _Collector:
     def __init__(self, first: Messages) -> None:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-        self.topic, self.type = first.topic, first.type
+        self.topic, self.type, self.definition = first.topic, first.type, first.definition
         self.warnings: list[str] = []
         self._store = get_typestore(Stores.EMPTY if first.definition else Stores.ROS2_JAZZY)
         if first.definition:
@@ -126,16 +147,31 @@ class _Collector:
         for name in cdr.types_within(self.type, self._store.fielddefs):
             if name not in self._store.fielddefs:
                 raise BagError(f'{self.topic}: the bag does not define its type {name}')
+        self._check_hash(first.type_hash)
         self._waiting: dict[int, list[Messages]] = {}
-        self._size, self._damaged = 0, 0
+        self._size, self._damaged, self._others = 0, 0, 0
         self._parts: dict[tuple[str, ...], list[tuple[np.ndarray, dict[str, np.ndarray]]]] = {}
 
     def add(self, messages: Messages) -> None:
-        """Take messages of one size."""
+        """Take messages of one size; raises BagError when they cannot be decoded."""
+        if (messages.type, messages.definition) != (self.type, self.definition):
+            self._others += len(messages.numbers)
+            return
         self._waiting.setdefault(messages.data.shape[1], []).append(messages)
         self._size += messages.data.size
         if self._size > BATCH:
             self._decode()
+
+    def _check_hash(self, published: str) -> None:
+        """Warn when the definition is not that of the messages that were published."""
+        if not re.fullmatch(HASH, published):
+            return
+        try:
+            found = self._store.hash_rihs01(self.type)
+        except Exception as error:  # whatever a damaged definition makes of it
+            found = f'{type(error).__name__}'
+        if found != published:
+            self.warnings.append(f'{self.topic}: its definition is not the one it was sent with')
 
     def _decode(self) -> None:
         for waiting in self._waiting.values():
@@ -158,6 +194,8 @@ class _Collector:
     def _parts_of(self, data: np.ndarray) -> Iterable[cdr.Part]:
         try:
             return list(cdr.decode(data, self.type, self._store.fielddefs))
+        except RecursionError:
+            raise BagError(f'{self.topic}: its type {self.type} holds itself') from None
         except cdr.NotFlatError:
             return [self._objects(number, row.tobytes()) for number, row in enumerate(data)]
 
@@ -172,7 +210,7 @@ class _Collector:
         return cdr.Part(np.array([number]), columns)
 
     def table(self) -> 'pd.DataFrame':
-        """Return all rows in the order of the bag."""
+        """Return all rows in the order of the bag; raises BagError as ``add`` does."""
         import pandas as pd
 
         self._decode()
@@ -184,6 +222,9 @@ class _Collector:
         self._parts = {}
         if self._damaged:
             self.warnings.append(f'{self.topic}: {self._damaged} messages are damaged')
+        if self._others:
+            words = f'{self._others} messages of another type are not read'
+            self.warnings.append(f'{self.topic}: {words}')
         table = frames[0] if len(frames) == 1 else pd.concat(frames) if frames else pd.DataFrame()
         return table.sort_index().reset_index(drop=True)
 
@@ -216,12 +257,13 @@ def recorded_configuration(bag: Bag) -> Configuration | None:
 
 
 class Run(NamedTuple):
-    """One run of the loop: its trace, and what it lacks, in words.
+    """One run of the loop: its trace, the ticks of its rows, and what it lacks, in words.
 
     The bag does not hold the signals that are ``missing``: they are NaN, or zero in whole numbers.
     """
 
     trace: Trace
+    ticks: np.ndarray
     warnings: list[str]
     missing: frozenset[str]
 
@@ -273,7 +315,7 @@ def trace_of(bag: Bag, namespace: str = '', run: int = -1) -> Run:
     for name, signals in COLUMNS.items():
         if name in tables:
             warnings += [f'{LOOP[name]}: has no {signals[s]}' for s in signals if s in missing]
-    return Run(trace, warnings, frozenset(missing))
+    return Run(trace, ticks, warnings, frozenset(missing))
 
 
 class _Rows(NamedTuple):

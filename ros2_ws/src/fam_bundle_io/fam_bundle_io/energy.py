@@ -78,12 +78,19 @@ def _spool_and_flow(
             spool = command[tick, unit] + (spool - command[tick, unit]) * decay
 
 
-def powers(trace: Trace, configuration: Configuration) -> Powers:
-    """Return all powers of a run that begins with the valves at rest."""
+def powers(
+    trace: Trace, configuration: Configuration, applied_spool: Array | None = None
+) -> Powers:
+    """Return all powers of a run that begins with the valves at rest.
+
+    ``applied_spool`` (ticks, units) are the commands that acted from each tick to the next, where
+    they are not those of the trace: in real time they may come late.
+    """
+    command = trace['spool'] if applied_spool is None else applied_spool
     law, step = hydraulic_law(configuration), steps(trace)
     source, pressure = trace['source_pressure'], trace['mu_pressure']
     flow = np.zeros_like(pressure)
-    _spool_and_flow(law, step, trace['spool'], source, pressure, flow)
+    _spool_and_flow(law, step, command, source, pressure, flow)
     length = configuration.fam.length[0]
     speed = np.gradient(trace['strain'], trace['time'])
     return Powers(

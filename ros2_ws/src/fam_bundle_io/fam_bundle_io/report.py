@@ -26,7 +26,7 @@ from fam_bundle_io.metrics import (
     tracking,
     whole_cycles,
 )
-from fam_bundle_io.timing import Timing, spread, timing
+from fam_bundle_io.timing import Timing, applied_spool, phases, spread, timing
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration
 from fam_bundle_model.schema import ConfigurationError
@@ -104,6 +104,8 @@ def _reported(
     bag: Bag, run: Run, namespace: str, name: str, configuration: Configuration | None
 ) -> ReportedRun:
     trace, warnings = run.trace, list(run.warnings)
+    if 'time' in run.missing:
+        raise BagError(f'{namespace}/bundle_state: has no time of its samples')
     if configuration is not None and len(configuration.fam.count) != trace['spool'].shape[1]:
         warnings.append(
             f'the parameters are of {len(configuration.fam.count)} motor units, the bag of '
@@ -118,12 +120,18 @@ def _reported(
     lacking = sorted(ENERGETIC & run.missing)
     found = None
     if configuration is not None and not lacking:
-        found = powers(trace, configuration)
+        found = powers(trace, configuration, applied_spool(bag, run, namespace))
     elif lacking:
         warnings.append(f'no energies without {", ".join(lacking)}')
     if found is not None:
         warnings += _doubts(energy(trace, found, whole).modelled_oil)
-    times = timing(bag, namespace)
+    times = timing(bag, run, namespace)
+    safe = {'time': float((step * times.safe).sum()), 'phases': len(phases(times.safe))}
+    if safe['phases']:
+        warnings.append(
+            f'the plant was safe, open to the tank, for {safe["time"]:.3f} s in '
+            f'{plural(safe["phases"], "phase")}'
+        )
     numbers = {
         'namespace': namespace,
         'warnings': warnings,
@@ -133,6 +141,7 @@ def _reported(
         'ticks': len(time),
         'start': whole.start,
         'stop': whole.stop,
+        'safe': safe,
         **_window_numbers(trace, run.missing, found, cycles[-1] if cycles else None),
         'whole_run': _window_numbers(trace, run.missing, found, whole),
         'cycles': [_window_numbers(trace, run.missing, found, cycle) for cycle in cycles],
@@ -216,6 +225,11 @@ def _timing_numbers(times: Timing) -> dict[str, Any]:
         'unanswered': {topic: times.samples - n for topic, n in times.answered.items()},
         'nodes': times.nodes,
     }
+
+
+def plural(count: float, word: str) -> str:
+    """Return a count with its noun."""
+    return f'{count:g} {word}' if count == 1 else f'{count:g} {word}s'
 
 
 def without_nan(content: Any) -> Any:

@@ -18,14 +18,22 @@ from fam_bundle_io.figures_style import (
     UPSHIFT,
 )
 from fam_bundle_io.metrics import Window, ticks_in
-from fam_bundle_io.report import ReportedRun
+from fam_bundle_io.report import ReportedRun, plural
+from fam_bundle_io.timing import phases
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
+MOST_PHASES = 200  # in which the plant was safe, that are marked
 POINTS = 50_000  # of a curve; longer ones are drawn by their extremes
 BINS = 80  # of a histogram
 MICROSECONDS = 1e6  # per s
+NODE_HEADINGS = {
+    'latency_p50': 'p50 (µs)',
+    'latency_p99': 'p99 (µs)',
+    'latency_max': 'max (µs)',
+    'cpu_share': 'CPU',
+}
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 72rem; margin: 2rem auto;
   padding: 0 1rem; }
@@ -57,15 +65,11 @@ def report_page(runs: Sequence[ReportedRun], troubles: Sequence[str]) -> str:
 <html lang="en"><head><meta charset="utf-8"><title>fam_bundle report</title>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <style>{STYLE}</style><script>{get_plotlyjs()}</script></head><body>
-<h1>Report on {_plural(len(runs), 'run')}</h1>
+<h1>Report on {plural(len(runs), 'run')}</h1>
 <nav>{_links(runs)}</nav>
 {''.join(parts)}
 </body></html>
 """
-
-
-def _plural(count: int, word: str) -> str:
-    return f'{count} {word}' if count == 1 else f'{count} {word}s'
 
 
 def _links(runs: Sequence[ReportedRun]) -> str:
@@ -104,7 +108,7 @@ def _warnings(words: Sequence[str]) -> list[str]:
     if not words:
         return []
     items = ''.join(f'<li>{html.escape(line)}</li>' for line in words)
-    return [f'<div class="warnings"><b>Missing or damaged</b><ul>{items}</ul></div>']
+    return [f'<div class="warnings"><b>Warnings</b><ul>{items}</ul></div>']
 
 
 def _summary(runs: Sequence[ReportedRun]) -> str:
@@ -151,10 +155,11 @@ def _run_section(run: ReportedRun, number: int) -> list[str]:
     if n['parameters_hash']:
         said += f', parameters {n["parameters_hash"][:12]}'
     thinned = '' if n['ticks'] <= POINTS else f' Curves are drawn by {POINTS} extremes.'
+    marked = ' Shaded: the plant was safe.' if n['safe']['phases'] else ''
     return [
         f'<h2 id="run{number}">{html.escape(run.name)}</h2>',
         f'<p class="note">{html.escape(said)}. Drag in a panel to zoom all of them, double-click '
-        f'to see the whole run again.{thinned}</p>',
+        f'to see the whole run again.{marked}{thinned}</p>',
         *_warnings(n['warnings']),
         _drawn(run_panels(run)),
         _cycle_table(run),
@@ -221,7 +226,7 @@ def _panels(titles: Sequence[str], heights: Sequence[float]) -> 'Figure':
     figure.update_layout(
         template='plotly_white',
         height=round(70 * sum(heights)),
-        margin={'l': 70, 'r': 20, 't': 20, 'b': 45},
+        margin={'l': 70, 'r': 20, 't': 35, 'b': 45},
         legend={'groupclick': 'toggleitem'},
         hovermode='x unified',
     )
@@ -310,6 +315,9 @@ def run_panels(run: ReportedRun) -> 'Figure':
     figure.update_yaxes(range=[-2.0 * longest, 4.0 * longest], row=2, col=1)
     figure.update_yaxes(dtick=1, range=[0.7, len(units) + 0.3], row=3, col=1)
     figure.update_xaxes(title_text='time (s)', row=len(titles), col=1)
+    for first, last in phases(run.timing.safe)[:MOST_PHASES]:
+        end = time[min(last + 1, len(time) - 1)]
+        figure.add_vrect(x0=time[first], x1=end, fillcolor='#CC79A7', opacity=0.3, line_width=0)
     return figure
 
 
@@ -374,7 +382,7 @@ def _energy_section(runs: Sequence[ReportedRun]) -> str:
         template='plotly_white',
         barmode='relative',
         height=180 + 60 * len(known),
-        margin={'l': 20, 'r': 20, 't': 20, 'b': 45},
+        margin={'l': 20, 'r': 20, 't': 35, 'b': 45},
         xaxis_title='energy of the last cycle (J)',
         yaxis={'automargin': True, 'autorange': 'reversed'},
     )
@@ -439,17 +447,19 @@ def _timing_section(runs: Sequence[ReportedRun]) -> Iterable[str]:
         yield _drawn(latencies(run))
         if numbers['nodes']:
             names = list(numbers['nodes'][0])
-            yield table(
-                names, ([_cell(node.get(name)) for name in names] for node in numbers['nodes'])
-            )
+            headings_of_nodes = [NODE_HEADINGS.get(name, name.replace('_', ' ')) for name in names]
+            rows_of_nodes = [[_cell(n, node.get(n)) for n in names] for node in numbers['nodes']]
+            yield table(headings_of_nodes, rows_of_nodes)
 
 
 def _spread(found: dict[str, float]) -> list[str]:
     return [_number(found.get(k), '.0f', MICROSECONDS) for k in ('median', 'p99', 'largest')]
 
 
-def _cell(value: Any) -> str:
-    return _number(value, '.3g') if isinstance(value, float) else str(value)
+def _cell(name: str, value: Any) -> str:
+    if name.startswith('latency'):
+        return _number(value, '.0f', MICROSECONDS)
+    return _number(value, '.0%') if name == 'cpu_share' else str(value)
 
 
 def latencies(run: ReportedRun) -> 'Figure':
@@ -471,8 +481,8 @@ def latencies(run: ReportedRun) -> 'Figure':
         )
     figure.update_layout(
         template='plotly_white',
-        height=280,
-        margin={'l': 70, 'r': 20, 't': 10, 'b': 45},
+        height=300,
+        margin={'l': 70, 'r': 20, 't': 35, 'b': 45},
         xaxis_title='time from the sample to its answer (µs)',
         yaxis_title='ticks',
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How punctual a recorded loop was: times between samples, and from a sample to its answers.
+"""How punctual a recorded loop was: time from sample to sample and to its answers.
 
 From the publishers' times in the bag. All nodes must have run on one machine, or on several whose
 clocks agree; a bag without publishers' times (SQLite) gives the recorder's instead.
@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fam_bundle_io.bag import LOOP, STATE, Bag, one_run
+from fam_bundle_io.bag import LOOP, STATE, Bag, Run, run_tables
+from fam_bundle_model.hydraulics import TO_TANK
 
 if TYPE_CHECKING:
     import pandas as pd
 
+COMMAND = 'fam_bundle_msgs/msg/ValveCommand'
 Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 COUNTS = (
     'ticks',
     'skipped_periods',
@@ -41,30 +44,40 @@ class Timing(NamedTuple):
 
     ``interval`` (n - 1,) is the time in s between two samples, ``answers`` by topic the time in s
     from a sample to what answers it, ``answered`` by topic how many of the ``samples`` have an
-    answer in the bag. ``nodes`` are the last reports of the nodes.
+    answer in the bag. ``safe`` (ticks,) tells at which ticks of the trace the plant did not
+    follow commands. ``nodes`` are the last reports of the nodes.
     """
 
     samples: int
     interval: Array
     answers: dict[str, Array]
     answered: dict[str, int]
+    safe: Flags
     nodes: list[dict[str, Any]]
 
 
-def timing(bag: Bag, namespace: str = '', run: int = -1) -> Timing:
-    """Return the times of a run; ``bundle_state`` must be in the bag."""
-    samples = one_run(bag.tables[f'{namespace}/{LOOP[STATE]}'], run)
+def timing(bag: Bag, found: Run, namespace: str = '', run: int = -1) -> Timing:
+    """Return the times of the run ``found`` in the bag."""
+    tables, _ = run_tables(bag, namespace, run)
+    samples = tables.pop(STATE)
     answers, answered = {}, {}
-    for short in LOOP.values():
-        table = bag.tables.get(f'{namespace}/{short}')
-        if short == LOOP[STATE] or table is None or 'tick' not in table:
-            continue
-        found = one_run(table, run)['published']
-        both = samples.index.intersection(found.index)
-        answered[short] = len(both)
-        answers[short] = _seconds(found.loc[both] - samples['published'].loc[both])
+    for name, table in tables.items():
+        both = samples.index.intersection(table.index)
+        answered[LOOP[name]] = len(both)
+        answers[LOOP[name]] = _seconds(
+            table['published'].loc[both] - samples['published'].loc[both]
+        )
     interval = _seconds(samples['published'].diff().iloc[1:])
-    return Timing(len(samples), interval, answers, answered, _reports(bag, namespace))
+    safe = np.zeros(len(found.ticks), bool)
+    if 'safe' in samples:
+        safe = samples['safe'].to_numpy(bool)[samples.index.get_indexer(found.ticks)]
+    return Timing(len(samples), interval, answers, answered, safe, _reports(bag, namespace))
+
+
+def phases(flags: Flags) -> list[tuple[int, int]]:
+    """Return first and last place of every stretch of ``flags`` that is true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [(int(a), int(z) - 1) for a, z in edges.reshape(-1, 2)]
 
 
 def spread(times: Array) -> Spread | None:
@@ -73,6 +86,24 @@ def spread(times: Array) -> Spread | None:
         return None
     median, p99 = np.percentile(times, (50.0, 99.0))
     return Spread(float(median), float(p99), float(times.max()))
+
+
+def applied_spool(bag: Bag, found: Run, namespace: str = '', run: int = -1) -> Array:
+    """Return the spool commands that act from each tick of a run to the next (ticks, units).
+
+    That is the newest command that was published before the next sample, one of an earlier tick
+    where the answer came late; and open to the tank while the plant was safe.
+    """
+    tables, _ = run_tables(bag, namespace, run)
+    samples, commands = tables[STATE], tables[COMMAND]
+    units = found.trace['spool'].shape[1]
+    spool = commands[[f'spool[{unit}]' for unit in range(units)]].to_numpy(float)
+    spool = np.vstack([np.full(units, TO_TANK), spool])  # before the first command
+    ends = [*samples['published'].to_numpy()[1:], np.inf]
+    acting = spool[np.searchsorted(commands['published'].to_numpy(), ends)]
+    if 'safe' in samples:
+        acting[samples['safe'].to_numpy(bool)] = TO_TANK
+    return np.asarray(acting[samples.index.get_indexer(found.ticks)])
 
 
 def _seconds(nanoseconds: 'pd.Series') -> Array:
