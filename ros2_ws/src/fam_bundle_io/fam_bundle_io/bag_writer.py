@@ -107,7 +107,8 @@ class BagWriter:
         found = records()
         try:
             if self.failure:
-                self._bag.abandon(found)
+                self._bag.abandon()
+                self._bag.write_metadata(found)
             else:
                 self._bag.close(found)
         except OSError as error:
@@ -207,15 +208,15 @@ class BagFolder:
         """Write the ``records`` of metadata by name, the last index, and ``metadata.yaml``."""
         if self._files:
             self._files[-1].close(records)
-        self._write_metadata(records)
+        self.write_metadata(records)
 
-    def abandon(self, records: Records) -> None:
-        """Write ``metadata.yaml`` beside a file that the disk did not take."""
+    def abandon(self) -> None:
+        """Close the newest file as it is."""
         if self._files:
             self._files[-1].abandon()
-        self._write_metadata(records)
 
-    def _write_metadata(self, records: Records) -> None:
+    def write_metadata(self, records: Records) -> None:
+        """Write ``metadata.yaml``."""
         information = bag_information(self._files, self._topics, {**self._head, **records})
         with whole_file(self.folder / 'metadata.yaml') as file:
             file.write(yaml.safe_dump(information, sort_keys=False).encode())

@@ -72,9 +72,14 @@ def assert_beginning(tables: dict[str, pd.DataFrame], least: int = 0) -> None:
             assert np.all(table['wrench.force.z'] == np.inf)
 
 
+def without_doubt(warnings: list[str]) -> list[str]:
+    """Most of these bags carry no checksums, and reading says so."""
+    return [words for words in warnings if 'carry no checksum' not in words]
+
+
 def assert_whole(path: Path) -> None:
     bag = read_bag(path)
-    assert bag.warnings == []
+    assert without_doubt(bag.warnings) == []
     assert bag.types == TOPICS
     assert_beginning(bag.tables, least=COUNT)
     assert [len(table) for table in bag.tables.values()] == [COUNT, COUNT]
@@ -129,7 +134,7 @@ def test_a_bag_needs_no_description_of_itself(made: Maker, tmp_path: Path, kind:
     assert_whole(file)
     shutil.copy(file, tmp_path)
     bag = read_bag(tmp_path)
-    assert bag.warnings == ['metadata.yaml is missing or damaged']
+    assert without_doubt(bag.warnings) == ['metadata.yaml is missing or damaged']
     assert_beginning(bag.tables, least=COUNT)
 
 
@@ -218,7 +223,7 @@ def test_a_serialization_that_is_not_known_is_named(made: Maker, tmp_path: Path)
         database.execute("UPDATE topics SET serialization_format = 'json' WHERE name = '/text'")
     database.close()
     bag = read_bag(tmp_path / file.name)
-    assert bag.warnings == ['/text: messages in json are not read']
+    assert without_doubt(bag.warnings) == ['/text: messages in json are not read']
     assert list(bag.tables) == ['/wrench']
 
 
