@@ -3,7 +3,7 @@
 
 import json
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 # A message of the loop begins with a header and a tick. In CDR: four bytes that tell the byte
@@ -97,14 +97,18 @@ class TopicLedger:
 
 
 def record_of(
-    summaries: Mapping[str, dict[str, Any]], dropped: int | None, skipped: Mapping[str, str]
+    summaries: Mapping[str, dict[str, Any]],
+    dropped: int | None,
+    skipped: Mapping[str, str],
+    damage: Sequence[str] = (),
 ) -> dict[str, str]:
     """Return what a bag says of its completeness, each value as JSON.
 
     ``summaries`` are those of the topics' ledgers, ``dropped`` the messages that the disk did not
-    take in time, None where nobody knows, ``skipped`` why a topic was not recorded.
+    take in time, None where nobody knows, ``skipped`` why a topic was not recorded, ``damage``
+    what was lost since, in words.
     """
-    missing = list(shortcomings(summaries, dropped or 0))
+    missing = [*damage, *shortcomings(summaries, dropped or 0)]
     found: dict[str, Any] = {
         'whole': not missing,
         'missing': missing,

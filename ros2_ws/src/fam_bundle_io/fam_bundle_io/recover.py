@@ -138,6 +138,7 @@ class _Recoverer:
                 summaries,
                 _json(before.get('dropped'), int),
                 _json(before.get('skipped_topics'), dict) or {},
+                self.damage,
             ),
             RECOVERY: {
                 'source': self.bag.resolve().name,
