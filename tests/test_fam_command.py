@@ -3,8 +3,10 @@
 
 import ast
 import importlib.util
+import json
 import os
 import re
+import shutil
 import signal
 import stat
 import subprocess
@@ -24,6 +26,7 @@ TOOLS = {
 }
 PROFILE = 'ros2_ws/src/fam_bundle_bringup/config/fastdds_loopback.xml'
 LOCKS = sorted((REPOSITORY / 'requirements').glob('*.txt'))
+NPM = 'tests/readers/package.json', 'tests/readers/package-lock.json'
 
 
 def executable(path, script):
@@ -46,6 +49,7 @@ class Tree:
             'fam',
             'cmake/wheel_include_dirs.cmake',
             PROFILE,
+            *NPM,
             *(f'requirements/{p.name}' for p in LOCKS),
         ):
             target = self.root / name
@@ -99,7 +103,11 @@ class Tree:
         (install / 'fam_environment.json').write_text(
             '{"PATH": "/sourced:", "PYTHONPATH": "/ours"}'
         )
+        self.stamp()
+
+    def stamp(self):
         for step in self.module().plan(False, True):
+            step.stamp.parent.mkdir(parents=True, exist_ok=True)
             step.stamp.write_text(step.digest)
 
     def build_is_due(self, colcon):
@@ -257,6 +265,26 @@ def test_a_vanished_interpreter_makes_the_packages_due(tree):
     assert tree.due() == ['Python packages']
 
 
+def test_the_readers_of_npm_are_installed_once_where_npm_is_and_only_for_tests(tree):
+    tree.pretend_set_up()
+    note, modules = tree.root / 'asked', tree.root / 'tests/readers/node_modules'
+    shutil.rmtree(modules, ignore_errors=True)
+    # As `npm ci` does it: what was there before is gone.
+    npm = f'echo "$@" >> {note}; /bin/rm -rf {modules}; /bin/mkdir {modules}'
+    assert tree.fam('test')[0] == 0
+    assert not modules.exists()
+    executable(tree.path / 'npm', f'{npm}; echo > {modules}/.package-lock.json')
+    assert tree.fam('setup')[0] == 0
+    assert not note.exists()
+    for _ in range(2):
+        assert tree.fam('test')[0] == 0
+    assert len(note.read_text().splitlines()) == 1
+    assert note.read_text().startswith(f'ci --prefix {tree.root / "tests/readers"} ')
+    (tree.root / NPM[1]).write_text('{}')
+    assert tree.fam('test')[0] == 0
+    assert len(note.read_text().splitlines()) == 2
+
+
 def test_a_step_that_fails_shows_the_end_of_its_log(tree):
     tree.build_is_due('for i in $(/usr/bin/seq 100); do echo line $i; done; exit 7')
     status, _, err = tree.fam('setup')
@@ -351,8 +379,7 @@ def test_run_starts_the_executable_in_the_sourced_environment(tree):
 def test_nothing_starts_that_would_use_every_network(tree):
     tree.pretend_set_up()
     (tree.root / PROFILE).unlink()
-    for step in tree.module().plan(False, True):
-        step.stamp.write_text(step.digest)
+    tree.stamp()
     status, out, err = tree.fam('run', 'some_nodes', 'some_node')
     assert (status, out) == (2, '')
     assert_one_line(err, PROFILE, 'is missing')
@@ -379,6 +406,18 @@ def test_a_lock_pins_with_hashes_and_holds_no_address(lock):
         if not block.startswith('#'):
             assert re.match(r'[a-z0-9-]+==\S+', block)
             assert '--hash=sha256:' in block
+
+
+def test_the_lock_of_npm_pins_with_hashes_and_holds_no_address():
+    text = (REPOSITORY / NPM[1]).read_text()
+    assert '://' not in text
+    packages = json.loads(text)['packages']
+    wanted = json.loads((REPOSITORY / NPM[0]).read_text())['dependencies']
+    assert packages.pop('')['dependencies'] == wanted
+    assert {f'node_modules/{name}' for name in wanted} < set(packages)
+    for package in packages.values():
+        assert re.fullmatch(r'sha512-\S+', package['integrity'])
+        assert re.fullmatch(r'[\d.]+', package['version'])
 
 
 def test_fam_is_executable():
