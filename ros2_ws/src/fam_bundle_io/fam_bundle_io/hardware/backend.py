@@ -11,6 +11,7 @@ Only ``arm`` lets a valve move, and ``make_safe`` takes that back. All calls com
 
 import dataclasses
 import importlib.metadata
+import time
 from collections.abc import Mapping
 from typing import Any, Protocol, cast
 
@@ -142,7 +143,10 @@ class Backend(Protocol):
         """
 
     def close(self) -> None:
-        """Put the safe volts out as far as possible and let go of the card. Never refused."""
+        """Put the safe volts out and let go of the card. Never refused.
+
+        Where they cannot be written it waits for the watchdog to bring them.
+        """
 
 
 def check_volts(call: str, volts: Volts, size: int) -> None:
@@ -217,13 +221,15 @@ class Card:
             self._stop_watchdog()
 
     def close(self) -> None:
-        """Put the safe volts out as far as possible and let go of the card; see Backend."""
+        """Put the safe volts out and let go of the card; see Backend."""
         if not self.configured:
             return
         try:
             self.make_safe()
         except OSError:
-            pass  # an expired or broken card: its watchdog, which runs on, is what is left
+            if self.armed and not self.expired:
+                # Only the watchdog can bring the safe volts now; who goes may take it along.
+                time.sleep(1.5 * self.setup.watchdog_timeout)
         finally:
             self.configured = self.armed = False
             self._let_go()

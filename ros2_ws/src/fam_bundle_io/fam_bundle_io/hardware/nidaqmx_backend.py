@@ -29,7 +29,9 @@ EXPIRED = -200644  # what a timer that is reset too late says
 class NidaqmxOptions:
     """Which card."""
 
-    device: str = word('name of the device in the vendor\'s configuration: "Dev1", say')
+    input_device: str = word('device or module of the inputs: "Dev1" or "cDAQ1Mod1", say')
+    output_device: str = word('device or module of the outputs')
+    watchdog_device: str = word('device or chassis that has the watchdog: "Dev1" or "cDAQ1", say')
 
 
 class NidaqmxBackend(Card):
@@ -52,16 +54,17 @@ class NidaqmxBackend(Card):
         self._ni = _import()
         self._failure = self._ni.errors.Error
         try:
-            self._open_watchdog(setup, options.device)
-            self._open_outputs(setup, options.device)
-            self._open_inputs(setup, options.device)
+            self._open_watchdog(setup, options)
+            self._open_outputs(setup, options.output_device)
+            self._open_inputs(setup, options.input_device)
         except self._failure as error:
             raise _backend_error(error) from error
 
-    def _open_watchdog(self, setup: Setup, device: str) -> None:
-        ni = self._ni
-        self._watchdog = ni.system.watchdog.WatchdogTask(device, timeout=setup.watchdog_timeout)
-        self._watchdog.clear_expiration()
+    def _open_watchdog(self, setup: Setup, options: NidaqmxOptions) -> None:
+        ni, device = self._ni, options.output_device
+        self._watchdog = ni.system.watchdog.WatchdogTask(
+            options.watchdog_device, timeout=setup.watchdog_timeout
+        )
         states = [
             ni.types.AOExpirationState(
                 f'{device}/ao{channel}', volts, ni.constants.WatchdogAOExpirState.VOLTAGE
@@ -71,6 +74,7 @@ class NidaqmxBackend(Card):
             )
         ]
         self._watchdog.cfg_watchdog_ao_expir_states(states)
+        self._watchdog.clear_expiration()
 
     def _open_outputs(self, setup: Setup, device: str) -> None:
         self._output = self._ni.Task()
