@@ -13,12 +13,12 @@ from fam_bundle_model.compile import direct
 from fam_bundle_model.hydraulics import TO_TANK
 from fam_bundle_model.parameters import Configuration, seconds
 from fam_bundle_msgs.msg import BundleState, ValveCommand
+from fam_bundle_node.answers import Answers
 from fam_bundle_node.command_watch import CommandWatch
 from fam_bundle_node.loop_node import LoopNode
 from fam_bundle_node.pacing import Lockstep, Pacing, Periodic
 from fam_bundle_node.run import run_node
 from fam_bundle_node.steady_timer import SteadyTimer
-from fam_bundle_node.ticks import TickError
 from fam_bundle_sim.plant import plant, plant_step, resting_state, truth
 from fam_bundle_sim.sensors import measure, noise_samples, sensors
 
@@ -36,7 +36,6 @@ GROUPS = (
 
 LAST_MESSAGES = Duration(seconds=10)
 MATCHING_PERIOD = 0.02  # s between two looks at who listens
-LEFTOVERS = 200  # ticks into a run in which commands of the run before may still come
 SAMPLES = 4096  # whose times are kept for their answers
 
 
@@ -67,11 +66,10 @@ class PlantSimulator(LoopNode):
         self.period_ns = self.configuration.period_ns()
         self.periods = self.configuration.ticks()
         self.period = 0  # since the start of the run
-        self.tick = -1  # of the newest sample
+        self.answers = Answers(self.counts, realtime=self.realtime)
         self.started_at = self.published_at = time.monotonic_ns()
         self.sampled_at = [0] * SAMPLES  # when (ns), by tick
         self.spool = np.zeros(units)
-        self.answered = -1  # tick of the newest command
         limit = round(self.configuration.run.command_timeout * 1e9 / self.period_ns)
         self.watch = CommandWatch(limit)
         self.failed = ''  # why a step went wrong
@@ -116,20 +114,22 @@ class PlantSimulator(LoopNode):
         silence = (time.monotonic_ns() - self.published_at) * 1e-9
         run = self.configuration.run
         over = self.realtime and self.period >= self.periods
-        waits = self.tick >= 0 and (not self.realtime or self.answered < 0)
+        waits = self.answers.sample >= 0 and (not self.realtime or self.answers.answered < 0)
         if self.failed:
             self.fail(self.failed)
-        elif over and (self.answered == self.tick or silence > run.command_timeout):
+        elif over and (
+            self.answers.answered == self.answers.sample or silence > run.command_timeout
+        ):
             self.finish()
         elif waits and silence > run.answer_timeout:
             timeout = f'{run.answer_timeout:g} s'
-            self.fail(f'valve_command: tick {self.tick} has not come within {timeout}')
+            self.fail(f'valve_command: tick {self.answers.sample} has not come within {timeout}')
 
     def state(self) -> str:
         """Return 'running', or what the plant waits for, or why it is safe."""
-        if self.tick < 0:
+        if self.answers.sample < 0:
             return f'waiting for {self.configuration.run.listeners} listeners of bundle_state'
-        if self.answered < 0:
+        if self.answers.answered < 0:
             return 'waiting for valve_command of tick 0'
         return self.watch.state()
 
@@ -139,12 +139,11 @@ class PlantSimulator(LoopNode):
 
     def on_valve_command(self, command: ValveCommand) -> None:
         """Hold the command; go on where the pacing waits for it."""
-        if not self.is_answer(command):
+        first = self.answers.answered < 0
+        if not self.answers.admit(command.tick):
             return
         self.meter.answered(command.tick, self.sampled_at[command.tick % SAMPLES])
-        first = self.answered < 0
         with self.lock:
-            self.answered = command.tick
             self.watch.answer(command.tick)
             self.spool = np.clip(command.spool, -1.0, 1.0)
             if command.vent:
@@ -155,34 +154,13 @@ class PlantSimulator(LoopNode):
         else:
             self.pacing.answered()
 
-    def is_answer(self, command: ValveCommand) -> bool:
-        """Return whether a command answers a sample that waits for it, and count it if not."""
-        if not self.realtime:
-            if command.tick != self.tick:
-                raise TickError(f'valve_command: tick {command.tick} came, expected {self.tick}')
-            return True
-        ahead = command.tick > self.tick
-        if (self.answered < 0 and command.tick != 0) or (ahead and self.tick < LEFTOVERS):
-            self.counts.late += 1  # of the run before, still in the controller's history
-            return False
-        if ahead:
-            raise TickError(f'valve_command: tick {command.tick} came before its sample')
-        if command.tick <= self.answered:
-            again = command.tick == self.answered
-            self.counts.duplicate += again
-            self.counts.out_of_order += not again
-            return False
-        self.counts.missing += command.tick - self.answered - 1
-        self.counts.late += command.tick < self.tick
-        return True
-
     def step(self, periods: int) -> None:
         """Advance by ``periods``, more than 1 after an overrun, and publish the next sample."""
         self.meter.skipped(periods)
         with self.lock:
             safe, spool, held_for = self.watch.safe, self.spool, self.watch.held_for()
             if self.realtime:
-                self.watch.next_sample(self.tick + 1, periods)
+                self.watch.next_sample(self.answers.sample + 1, periods)
         self.period += periods
         if self.period >= self.periods:
             self.end()
@@ -200,10 +178,10 @@ class PlantSimulator(LoopNode):
         true = self.truth(self.rig, self.state_vector, self.mu_pressure)
         seen = self.measure(self.sensors, true, next(self.noise), self.mu_pressure)
         steady_time = time.monotonic_ns() if due is None else due
-        self.tick += 1
-        self.published_at = self.sampled_at[self.tick % SAMPLES] = steady_time
+        self.answers.sample += 1
+        self.published_at = self.sampled_at[self.answers.sample % SAMPLES] = steady_time
         message = BundleState(
-            tick=self.tick,
+            tick=self.answers.sample,
             steady_time=steady_time,
             safe=self.watch.safe,
             mu_pressure=self.mu_pressure.tolist(),
@@ -224,7 +202,7 @@ class PlantSimulator(LoopNode):
         """Say how fast the run was, and end the node."""
         elapsed = (time.monotonic_ns() - self.started_at) * 1e-9
         self.report()
-        samples, whole = self.tick + 1, self.meter.whole_run(self.period_ns)
+        samples, whole = self.answers.sample + 1, self.meter.whole_run(self.period_ns)
         self.get_logger().info(f'ran {samples} ticks in {elapsed:.4f} s; {whole.words()}')
         self.publisher.wait_for_all_acked(LAST_MESSAGES)  # a recorder may be behind
         self.succeed()
