@@ -22,7 +22,7 @@ from fam_bundle_node.qos import (
     REALTIME_PUBLISHER,
     REALTIME_SUBSCRIPTION,
 )
-from fam_bundle_node.stamps import StampClock
+from fam_bundle_node.stamps import StampClock, begins_anew
 from fam_bundle_node.statistics_publisher import StatisticsPublisher
 from fam_bundle_node.steady_timer import SteadyTimer
 from fam_bundle_node.ticks import Strikes, TickCounts, TickError, TickFilter, TickOrder
@@ -219,12 +219,11 @@ class Controller(LoopNode):
     def time_step(self, sample: Any) -> float:
         """Return the time in s since the last sample; restart the law where that has no meaning.
 
-        That is at the start of a run, after a gap, and as long as the plant is safe: a law whose
-        output is not applied must not wind up. Raises TickError when time stands still.
+        Raises TickError when time stands still.
         """
         gap = self.stamps.gap(sample.header.stamp)
-        steady = 0.0 <= gap <= self.configuration.run.command_timeout
-        if sample.tick == 0 or sample.safe or not steady:
+        timeout = self.configuration.run.command_timeout
+        if begins_anew(sample.tick, sample.safe, gap, timeout):
             self.stamps.restart()
             self.restart()
         return self.stamps.since_last(sample.header.stamp)

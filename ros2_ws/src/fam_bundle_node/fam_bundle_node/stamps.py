@@ -19,6 +19,15 @@ def nanoseconds(stamp: Stamp) -> int:
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
+def begins_anew(tick: int, safe: bool, gap: float, timeout: float) -> bool:
+    """Return whether a law starts again at a sample that came ``gap`` s after the one before.
+
+    At the start of a run, while the plant is safe, for a law whose output is not applied must not
+    wind up, and where the time between has no meaning: it went back, or is beyond ``timeout`` s.
+    """
+    return tick == 0 or safe or not 0.0 <= gap <= timeout
+
+
 class StampClock:
     """Turns the stamps of successive messages into time steps."""
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fam_bundle_node.stamps import StampClock, nanoseconds
+from fam_bundle_node.stamps import StampClock, begins_anew, nanoseconds
 from fam_bundle_node.ticks import TickError
 
 FIRST_STEP = 1_000_000  # ns
@@ -70,3 +70,19 @@ def test_after_a_restart_the_next_stamp_is_the_first():
     assert clock.gap(stamp(0)) == 0.0
     assert clock.since_last(stamp(0)) == 0.001
     assert clock.since_last(stamp(3 * FIRST_STEP)) == 0.003
+
+
+@pytest.mark.parametrize(
+    ('tick', 'safe', 'gap', 'anew'),
+    [
+        (1, False, 0.001, False),
+        (1, False, 0.015, False),
+        (1, False, 0.016, True),
+        (1, False, 0.0, False),  # the first stamp
+        (1, False, -0.001, True),
+        (1, True, 0.001, True),
+        (0, False, 0.001, True),
+    ],
+)
+def test_a_law_begins_anew_with_a_run_while_safe_and_after_a_gap(tick, safe, gap, anew):
+    assert begins_anew(tick, safe, gap, timeout=0.015) is anew
