@@ -62,7 +62,7 @@ class _Sensor:
 class SensorCalibration(_Sensor):
     """One sensor: value = gain x (volts - offset)."""
 
-    gain: float = number('unit/V', 'value per volt; negative where the signal falls')
+    gain: float = number('SI/V', 'value per volt; negative where the signal falls')
     zero_value: float = number(
         'unit',
         'true value while every motor unit is vented: what zeroing makes of it',
@@ -156,6 +156,7 @@ class Scaling:
         self.null = np.array([v.null_volts for v in valves])
         self.dead = np.array([v.direction() * v.dead_band for v in valves])
         self.span = np.array([v.direction() * (v.full_scale_volts - v.dead_band) for v in valves])
+        self._dead_width = np.abs(self.dead)
         self._side = np.empty(len(valves))
         self._inside = np.empty(len(valves), dtype=np.bool_)
         self.safe_volts = np.empty(len(valves))
@@ -182,11 +183,10 @@ class Scaling:
     def to_spool(self, volts: Volts, spool: Values) -> None:
         """Fill ``spool`` with what ``volts`` command, 0 within the dead band; both (units,)."""
         np.subtract(volts, self.null, out=spool)
-        # Towards zero by the dead band, and not beyond it.
+        np.abs(spool, out=self._side)
+        np.less_equal(self._side, self._dead_width, out=self._inside)
         np.copysign(self.dead, spool, out=self._side)
         np.subtract(spool, self._side, out=spool)
-        np.multiply(spool, self._side, out=self._side)
-        np.less(self._side, 0.0, out=self._inside)
         np.copyto(spool, 0.0, where=self._inside)
         np.divide(spool, self.span, out=spool)
 
@@ -384,6 +384,12 @@ def write_hardware(hardware: HardwareFile, path: Path) -> None:
 
     Comments of the file that it came from are lost.
     """
+    with whole_file(path) as file:
+        file.write(hardware_text(hardware).encode())
+
+
+def hardware_text(hardware: HardwareFile) -> str:
+    """Return a rig as YAML."""
     import yaml
 
     calibration = hardware.calibration
@@ -396,5 +402,4 @@ def write_hardware(hardware: HardwareFile, path: Path) -> None:
         'limits': dataclasses.asdict(hardware.limits),
         'backends': hardware.options,
     }
-    with whole_file(path) as file:
-        file.write(str(yaml.safe_dump(content, sort_keys=False)).encode())
+    return str(yaml.safe_dump(content, sort_keys=False))

@@ -54,7 +54,7 @@ class Limits:
         exclusive=True,
     )
     sensor_samples: int = integer(
-        'samples in a row that are no measurement and are a fault', 3, 5, default=4
+        'samples that are no measurement, less those that are, and are a fault', 3, 5, default=4
     )
     frozen_samples: int = integer(
         'samples in a row that are equal to the last bit and are a fault; 0 never is',

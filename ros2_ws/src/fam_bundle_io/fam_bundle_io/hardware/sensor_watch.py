@@ -46,7 +46,7 @@ class SensorWatch:
         self.degraded = np.zeros(count, dtype=np.bool_)
         self.has_values = False  # every channel has had a good value
         self.measuring = False  # every channel that is not expendable, in the newest sample
-        self.bad = np.zeros(count, dtype=np.int64)  # samples in a row that are no measurement
+        self.bad = np.zeros(count, dtype=np.int64)  # counts samples that are no measurement
         self._equal = np.zeros(count, dtype=np.int64)  # to the sample before, in a row
         self._new = np.ones(count, dtype=np.bool_)  # has had no good value yet
         self._before: Volts = np.full(count, np.nan)
@@ -75,14 +75,12 @@ class SensorWatch:
         self._count_equal(volts)
         self._judge(volts, values, elapsed)
         np.logical_not(well, out=flag)
-        np.add(self.bad, 1, out=self.bad)
-        np.multiply(self.bad, flag, out=self.bad)
+        self._count_bad()
         np.copyto(self.good, values, where=well)
         np.logical_and(self._new, flag, out=self._new)
         self.measuring = not flag.any()
         if self.measuring:
             self.has_values = True
-            self.degraded.fill(False)
             return ''
         np.copyto(values, self.good)
         self.has_values = not self._new.any()
@@ -97,13 +95,19 @@ class SensorWatch:
         np.multiply(self._equal, self._flag, out=self._equal)
         np.copyto(self._before, volts)
 
+    def _count_bad(self) -> None:
+        """Count bad samples up and good ones down: a loose contact adds up, a spike does not."""
+        for _ in range(2):
+            np.add(self.bad, self._flag, out=self.bad)
+        np.subtract(self.bad, 1, out=self.bad)
+        np.maximum(self.bad, 0, out=self.bad)
+        np.minimum(self.bad, self.limits.sensor_samples, out=self.bad)
+        np.greater_equal(self.bad, self.limits.sensor_samples, out=self.degraded)
+
     def _judge(self, volts: Volts, values: Values, elapsed: float) -> None:
         """Fill ``_well``; comparisons with NaN are false, so NaN is not well."""
         well, flag = self._well, self._flag
-        # After bad samples the value may have come farther.
-        np.add(self.bad, 1, out=self._room)
-        np.multiply(self._room, self.rate, out=self._room)
-        np.multiply(self._room, elapsed, out=self._room)
+        np.multiply(self.rate, elapsed, out=self._room)
         np.subtract(values, self.good, out=self._step)
         np.abs(self._step, out=self._step)
         np.less_equal(self._step, self._room, out=well)
@@ -117,8 +121,7 @@ class SensorWatch:
             np.logical_and(well, flag, out=well)
 
     def _lost(self, volts: Volts) -> str:
-        """Mark what is lost for good; return the first that the loop cannot do without."""
-        np.greater_equal(self.bad, self.limits.sensor_samples, out=self.degraded)
+        """Return the first that is lost for good and that the loop cannot do without."""
         for i in np.flatnonzero(self.degraded):
             if i not in EXPENDABLE:
                 return self._reason(int(i), float(volts[i]))
