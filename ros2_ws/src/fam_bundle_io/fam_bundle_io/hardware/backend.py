@@ -217,8 +217,8 @@ class Card:
         self._ready('make_safe')
         self._write(self.setup.safe_volts)
         if self.armed:
-            self.armed = False
             self._stop_watchdog()
+            self.armed = False
 
     def close(self) -> None:
         """Put the safe volts out and let go of the card; see Backend."""

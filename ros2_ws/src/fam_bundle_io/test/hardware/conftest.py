@@ -49,7 +49,8 @@ def hardware():
             'watchdog_device': 'Fake1',
         },
     }
-    calibration = dataclasses.replace(found.calibration, valves=valves)
+    strain = dataclasses.replace(found.calibration.strain, zero_value=0.0)
+    calibration = dataclasses.replace(found.calibration, strain=strain, valves=valves)
     return dataclasses.replace(found, calibration=calibration, options=options)
 
 

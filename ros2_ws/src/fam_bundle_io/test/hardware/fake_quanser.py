@@ -52,6 +52,7 @@ class Board:
         self.expired = False
         self.timeout = None  # of the running watchdog, s
         self.left = 0.0
+        self.time = 0.0  # s
         self.open = False
         self.calls = []
         self.broken = {}  # by call: what it raises
@@ -60,6 +61,7 @@ class Board:
 
     def advance(self, seconds):
         """Let time pass; the watchdog may expire."""
+        self.time += seconds
         if self.timeout is not None and not self.expired:
             self.left -= seconds
             if self.left < 0.0:
