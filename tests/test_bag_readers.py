@@ -5,7 +5,7 @@ import json
 import shutil
 import struct
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,15 +15,12 @@ from mcap_ros2.decoder import DecoderFactory
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from fam_bundle_bringup.experiment import default_configuration
-from fam_bundle_bringup.graph import run_graph
 from fam_bundle_io.bag import read_bag
-from fam_bundle_model.parameters import load_configuration
+from fam_bundle_model.parameters import Configuration
 
 NPM_READER = Path(__file__).parent / 'readers' / 'read.mjs'
 EACH_TICK = ('/bundle_state', '/pressure_reference', '/recruitment_state', '/valve_command')
 TOPICS = {*EACH_TICK, '/lag_table', '/loop_statistics', '/diagnostics'}
-REFERENCE = {'amplitude': 0.06, 'frequency': 0.5, 'cycles': 1}
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4  # kinds of fields in rosbags' type system
 DTYPES = {'f': 'float64', 'b': 'bool', 'i': 'int64', 'u': 'uint64', 'O': 'string'}
 INFINITY = '7ff0000000000000'
@@ -42,18 +39,10 @@ class Message(NamedTuple):
 Messages = dict[str, list[Message]]  # by topic
 
 
-class Recorded(NamedTuple):
-    bag: Path
-    ticks: int
-
-
-@pytest.fixture(scope='module')
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    folder = tmp_path_factory.mktemp('run')
-    changes = {'recruitment': {'scheme': 'lag_pressure'}, 'reference': REFERENCE}
-    configuration = load_configuration(default_configuration(), changes)
-    run_graph(configuration, folder, record=True)
-    return Recorded(folder / 'bag', configuration.ticks())
+@pytest.fixture
+def bag(recorded_runs: Path) -> Path:
+    """The bag of a run through the graph."""
+    return recorded_runs / 'lag_pressure' / 'bag'
 
 
 # ---- Values as texts that differ when a bit does ----
@@ -154,12 +143,10 @@ def with_tables(bag: Path) -> Messages:
                     row.update(values_of(name, kinds[name], value, types))
                 else:
                     row[name] = text(base, value)
-        found[topic] = [
-            Message(received, published, values)
-            for received, published, values in zip(
-                table['received'], table['published'], rows, strict=True
-            )
-        ]
+        times = zip(table['received'].tolist(), table['published'].tolist(), strict=True)
+        messages = [Message(*both, values) for both, values in zip(times, rows, strict=True)]
+        # The rows are in the order of the file; the other readers go by the time.
+        found[topic] = sorted(messages, key=lambda message: message.received)
     return found
 
 
@@ -178,22 +165,24 @@ def assert_same(some: Messages, others: Messages) -> None:
                 assert one.published == other.published, where
 
 
-def test_the_tables_are_what_rosbags_decodes(recorded: Recorded) -> None:
-    assert_same(with_tables(recorded.bag), with_rosbags(recorded.bag))
+def test_the_tables_are_what_rosbags_decodes(bag: Path) -> None:
+    assert_same(with_tables(bag), with_rosbags(bag))
 
 
-def test_the_tables_are_what_mcap_decodes(recorded: Recorded) -> None:
-    assert_same(with_tables(recorded.bag), with_mcap(recorded.bag))
+def test_the_tables_are_what_mcap_decodes(bag: Path) -> None:
+    assert_same(with_tables(bag), with_mcap(bag))
 
 
-def test_the_tables_are_what_the_npm_readers_decode(recorded: Recorded) -> None:
-    assert_same(with_tables(recorded.bag), with_npm(recorded.bag))
+def test_the_tables_are_what_the_npm_readers_decode(bag: Path) -> None:
+    assert_same(with_tables(bag), with_npm(bag))
 
 
-def test_the_bag_has_what_is_hard_to_decode(recorded: Recorded) -> None:
+def test_the_bag_has_what_is_hard_to_decode(
+    bag: Path, quick: Callable[..., Configuration]
+) -> None:
     """Else the readers would agree on little: values that are not finite, nested arrays, texts."""
-    found = with_tables(recorded.bag)
-    assert [len(found[topic]) for topic in EACH_TICK] == [recorded.ticks] * len(EACH_TICK)
+    found = with_tables(bag)
+    assert {len(found[topic]) for topic in EACH_TICK} == {quick().ticks()}
     supervisor = [message.values for message in found['/recruitment_state']]
     assert {values['time_to_saturation'] == INFINITY for values in supervisor} == {True, False}
     assert any(m.values['latency_p50'] == 'nan' for m in found['/loop_statistics'])
@@ -206,8 +195,8 @@ def test_the_bag_has_what_is_hard_to_decode(recorded: Recorded) -> None:
     assert any('status[0].values[3].key' in m.values for m in found['/diagnostics'])
 
 
-def test_a_change_of_one_bit_is_seen(recorded: Recorded) -> None:
-    some, others = with_tables(recorded.bag), with_tables(recorded.bag)
+def test_a_change_of_one_bit_is_seen(bag: Path) -> None:
+    some, others = with_tables(bag), with_tables(bag)
     values = others['/valve_command'][-1].values
     values['spool[1]'] = f'{int(values["spool[1]"], 16) ^ 1:016x}'
     with pytest.raises(AssertionError, match=r'/valve_command, message'):
