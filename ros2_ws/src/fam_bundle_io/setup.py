@@ -20,7 +20,10 @@ setup(
     extras_require={'test': ['pytest']},
     zip_safe=False,
     entry_points={
-        'console_scripts': ['bag_recorder = fam_bundle_io.bag_recorder_node:main'],
+        'console_scripts': [
+            'bag_recorder = fam_bundle_io.bag_recorder_node:main',
+            'hardware_bridge = fam_bundle_io.hardware_bridge_node:main',
+        ],
         'fam_bundle.backends': [
             'mock = fam_bundle_io.hardware.mock_backend:MockBackend',
             'nidaqmx = fam_bundle_io.hardware.nidaqmx_backend:NidaqmxBackend',

@@ -14,6 +14,7 @@ from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_bringup.graph import run_graph
 from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.offline import run_offline
+from fam_bundle_io.hardware.calibration import HardwareFile, write_hardware
 from fam_bundle_io.metrics import Tracking, shift_times, tracking
 from fam_bundle_io.trace import Trace, save_trace
 from fam_bundle_model.bundle import check_reachable, motor_units
@@ -105,7 +106,8 @@ def metrics_of(configuration: Configuration, pace: str, trace: Trace) -> dict[st
 
 def loop_of(reports: list[dict[str, Any]]) -> dict[str, Any]:
     """Return what the plant's loop statistics come to: counts, and every state but 'running'."""
-    plant = [report for report in reports if report['node'].endswith('/plant_simulator')]
+    owners = ('/plant_simulator', '/hardware_bridge')
+    plant = [report for report in reports if report['node'].endswith(owners)]
     last = plant[-1] if plant else {}
     counts = ('missing', 'late', 'duplicate', 'out_of_order', 'refused')
     return {
@@ -113,6 +115,20 @@ def loop_of(reports: list[dict[str, Any]]) -> dict[str, Any]:
         **{name: last.get(name, 0) for name in ('skipped_periods', 'overruns', *counts)},
         'states': list(dict.fromkeys(r['state'] for r in plant if r['state'] != 'running')),
     }
+
+
+def with_bridge(
+    configuration: Configuration, pace: str, hardware: HardwareFile, path: Path
+) -> Configuration:
+    """Write ``hardware`` to ``path`` and return the configuration of a bridge that uses it.
+
+    A simulated rig takes the pace of the run, and rests until the first command.
+    """
+    volts = {'pace': 'steady' if pace == 'realtime' else 'lockstep', 'hold': True}
+    options = {**hardware.options, 'volts': {**hardware.options.get('volts', {}), **volts}}
+    write_hardware(dataclasses.replace(hardware, options=options), path)
+    bridge = dataclasses.replace(configuration.bridge, hardware=str(path.resolve()), start='armed')
+    return dataclasses.replace(configuration, bridge=bridge)
 
 
 def bag_of(bag: Path) -> dict[str, Any]:
@@ -156,15 +172,19 @@ def run_experiment(
     progress: Callable[[int], None] | None = None,
     *,
     composed: bool = False,
+    hardware: HardwareFile | None = None,
     record: bool = False,
 ) -> Result:
     """Run ``configuration`` and write its parameters, trace and metrics to ``folder``.
 
+    With ``hardware`` the hardware bridge takes the place of the plant simulator.
     With ``record`` all topics go to the bag ``folder / 'bag'``, which must not exist.
     Raises ConfigurationError when ``folder`` cannot be written, and RunFailed when the run
     ends early; the trace of the ticks until then is kept.
     """
     prepare_folder(folder, RESULTS)
+    if hardware is not None:
+        configuration = with_bridge(configuration, pace, hardware, folder / 'hardware.yaml')
     write_yaml(configuration, folder / 'parameters.yaml')
     try:
         if pace == 'offline':
@@ -172,7 +192,14 @@ def run_experiment(
         else:
             run = dataclasses.replace(configuration.run, pace=pace)
             paced = dataclasses.replace(configuration, run=run)
-            trace = run_graph(paced, folder, progress, composed=composed, record=record)
+            trace = run_graph(
+                paced,
+                folder,
+                progress,
+                composed=composed,
+                bridge=hardware is not None,
+                record=record,
+            )
     except RunFailed as error:
         save_trace(error.trace, folder / 'trace.npz')
         raise

@@ -28,7 +28,8 @@ NODES = (
     ('fam_bundle_sim', 'plant_simulator'),
 )
 COMPOSED = ('fam_bundle_bringup', 'composed_loop')
-OWNERS = ('plant_simulator', 'composed_loop')  # hold the plant, whose end is the run's
+BRIDGE = ('fam_bundle_io', 'hardware_bridge')  # in place of the plant simulator
+OWNERS = ('plant_simulator', 'hardware_bridge', 'composed_loop')  # whose end is the run's
 LOOP_LISTENERS = 3  # strain controller, supervisor, pressure controller
 SLICE = 0.05  # s of listening between two looks at the processes
 BAG_TIMEOUT = 20.0  # s that the bag recorder gets to write what it has
@@ -57,21 +58,24 @@ def start_nodes(
     listeners: int,
     *,
     composed: bool = False,
+    bridge: bool = False,
     bundle: str = '',
 ) -> str:
     """Start the nodes with one parameter file, each as a process or all in one.
 
-    ``bundle`` names the namespace of one of several. Returns the name of the process that ends
-    with the run.
+    ``bridge`` asks for the hardware bridge in place of the plant simulator, ``bundle`` names the
+    namespace of one of several. Returns the name of the process that ends with the run.
     """
-    for package, name in (COMPOSED,) if composed else NODES:
+    nodes: Sequence[tuple[str, str]] = (COMPOSED,) if composed else NODES
+    nodes = [BRIDGE if bridge and name == 'plant_simulator' else (p, name) for p, name in nodes]
+    for package, name in nodes:
         command = [executable(package, name), '--ros-args', '--params-file', str(parameter_file)]
         if name in OWNERS:
             command += ['-p', f'run.listeners:={listeners}']
         if bundle:
             command += ['-r', f'__ns:=/{bundle}']
         group.start(f'{bundle}{name}', command)
-    return f'{bundle}{COMPOSED[1] if composed else "plant_simulator"}'
+    return f'{bundle}{nodes[-1][1]}'
 
 
 def run_graph(
@@ -80,9 +84,12 @@ def run_graph(
     progress: Callable[[int], None] | None = None,
     *,
     composed: bool = False,
+    bridge: bool = False,
     record: bool = False,
 ) -> Trace:
     """Run ``configuration`` through the graph and return its trace.
+
+    With ``bridge`` the hardware bridge takes the place of the plant simulator.
 
     The nodes' parameter file, what they print and their loop statistics go to ``folder``, and to
     ``folder / 'bag'`` all topics if they are to be recorded.
@@ -96,7 +103,7 @@ def run_graph(
         with nodes_in(folder) as group:
             bag = start_bag_recorder(group, parameter_file, folder / 'bag') if record else None
             listeners = LOOP_LISTENERS + 1 + record
-            owner = start_nodes(group, parameter_file, listeners, composed=composed)
+            owner = start_nodes(group, parameter_file, listeners, composed=composed, bridge=bridge)
             try:
                 while not group.finished(owner):
                     listen(SLICE)

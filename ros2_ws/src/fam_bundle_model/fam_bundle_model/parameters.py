@@ -24,6 +24,7 @@ from fam_bundle_model.schema import (
     per_unit,
     positive,
     unknown,
+    word,
 )
 
 PACES = ('lockstep', 'realtime')
@@ -243,6 +244,28 @@ class ProcessParameters:
 
 
 @dataclass(frozen=True)
+class BridgeParameters:
+    """The hardware bridge; the card's own settings are in its hardware file."""
+
+    backend: str = word('registered name of what drives the card', default='volts')
+    hardware: str = word(
+        'file of calibration, limits and options of the card', default='hardware.yaml'
+    )
+    start: str = choice(
+        'how far it goes by itself; armed: valves move as soon as the loop has closed',
+        ('unconfigured', 'inactive', 'armed'),
+        default='unconfigured',
+    )
+    answer_share: float = number(
+        '',
+        'share of a period for which a command that answers its sample is waited for',
+        default=0.8,
+        minimum=0.0,
+        maximum=1.0,
+    )
+
+
+@dataclass(frozen=True)
 class Configuration:
     """One bundle, its rig, its controllers and its reference."""
 
@@ -261,6 +284,7 @@ class Configuration:
     reference: ReferenceParameters
     run: RunParameters
     process: ProcessParameters
+    bridge: BridgeParameters
 
     def duration(self) -> float:
         """Return the length of the run in s."""
@@ -276,7 +300,7 @@ class Configuration:
 
     def hash(self, *groups: str) -> str:
         """Return a SHA-256 over the values of the named groups, or of all that shape a result."""
-        names = groups or [name for name in GROUPS if name not in ('run', 'process')]
+        names = groups or [name for name in GROUPS if name not in ('run', 'process', 'bridge')]
         chosen = {name: dataclasses.asdict(getattr(self, name)) for name in names}
         return hashlib.sha256(json.dumps(chosen, sort_keys=True).encode()).hexdigest()
 

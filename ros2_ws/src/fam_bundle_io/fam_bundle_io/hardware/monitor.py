@@ -94,6 +94,11 @@ class Monitor:
         """Why the fault is latched, or nothing."""
         return self._safety.fault
 
+    @property
+    def readable(self) -> bool:
+        """Whether the newest sample could be read."""
+        return self._readable
+
     def now(self) -> int:
         """Return the time in ns by which commands are to be stamped when they come."""
         return self._sample.tick * self._period_ns if self._clock is None else self._clock()
