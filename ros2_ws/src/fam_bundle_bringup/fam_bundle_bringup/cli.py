@@ -12,6 +12,7 @@ from typing import Any
 
 from fam_bundle_bringup.bag_commands import NAMES as BAG_COMMANDS
 from fam_bundle_bringup.bag_commands import add_bag_commands, run_bag_command
+from fam_bundle_bringup.bridge_options import add_bridge_options, check_backend, hardware_of
 from fam_bundle_bringup.domain_marker import domain_number
 from fam_bundle_bringup.experiment import (
     PACES,
@@ -100,6 +101,7 @@ def _add_experiment(commands: Any) -> None:
     experiment.add_argument(
         '--record', action='store_true', help='record all topics to DIR/bag (rosbag2, MCAP)'
     )
+    add_bridge_options(experiment)
     experiment.add_argument('--reference', metavar='sine', help='waveform of the strain reference')
     experiment.add_argument('--amplitude', metavar='STRAIN', help='half of its peak strain')
     experiment.add_argument('--frequency', metavar='HZ', help='its frequency')
@@ -155,6 +157,7 @@ def changes_of(options: argparse.Namespace) -> Mapping[str, Mapping[str, Any]]:
         ('reference', 'amplitude'): options.amplitude,
         ('reference', 'frequency'): options.frequency,
         ('reference', 'cycles'): options.cycles,
+        ('bridge', 'backend'): options.backend,
     }
     changes: dict[str, dict[str, Any]] = {}
     for (group, name), value in wanted.items():
@@ -170,6 +173,7 @@ def run_experiment_command(options: argparse.Namespace, configuration: Configura
 
     scheme = configuration.recruitment.scheme
     pace = options.pace or configuration.run.pace
+    hardware = hardware_of(options.backend, options.hardware, configuration)
     with progress_bar(f'{scheme}, {pace}', configuration.ticks()) as progress:
         result = run_experiment(
             configuration,
@@ -177,6 +181,7 @@ def run_experiment_command(options: argparse.Namespace, configuration: Configura
             options.out,
             progress,
             composed=options.composed,
+            hardware=hardware,
             record=options.record,
         )
     metrics = result.metrics
@@ -246,6 +251,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         changes = changes_of(options) if options.command == 'experiment' else {}
         if options.command == 'experiment' and options.composed and options.pace == 'offline':
             raise ConfigurationError('--composed: --pace offline has no nodes to compose')
+        if options.command == 'experiment':
+            check_backend(options.backend, options)
         if options.command == 'experiment' and options.record:
             if options.pace == 'offline':
                 raise ConfigurationError('--record: --pace offline has no topics to record')

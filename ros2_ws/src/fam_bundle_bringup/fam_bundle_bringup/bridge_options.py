@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The options by which an experiment goes through the hardware bridge."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from fam_bundle_bringup.experiment import default_configuration
+from fam_bundle_io.hardware.backend import backend_names
+from fam_bundle_io.hardware.calibration import HardwareFile, load_hardware
+from fam_bundle_model.parameters import Configuration
+from fam_bundle_model.schema import ConfigurationError
+
+SIMULATED = ('volts', 'mock')  # backends that move nothing
+
+
+def add_bridge_options(command: argparse.ArgumentParser) -> None:
+    """Add the options to a command."""
+    command.add_argument(
+        '--backend',
+        metavar='NAME',
+        help='through the hardware bridge and this card in place of the plant simulator: volts '
+        '(the plant behind simulated volts), or a rig: quanser, nidaqmx',
+    )
+    command.add_argument(
+        '--hardware',
+        type=Path,
+        metavar='FILE',
+        help='calibration and limits of the rig (default, for volts: that of the simulated one)',
+    )
+
+
+def check_backend(backend: str | None, options: argparse.Namespace) -> None:
+    """Raise ConfigurationError where options do not fit together for a hardware bridge."""
+    if backend is None:
+        if options.hardware is not None:
+            raise ConfigurationError('--hardware: of which card? name it with --backend')
+        return
+    if backend not in backend_names():
+        known = ', '.join(backend_names())
+        raise ConfigurationError(f'--backend {backend}: not known; there are: {known}')
+    if options.composed:
+        raise ConfigurationError('--backend: not with --composed')
+    if options.pace == 'offline':
+        raise ConfigurationError('--backend: --pace offline has no bridge')
+    if backend in SIMULATED:
+        return
+    if options.hardware is None:
+        raise ConfigurationError(
+            f'--backend {backend}: needs --hardware FILE, the calibration of this very rig'
+        )
+    if options.pace != 'realtime':
+        raise ConfigurationError(f'--backend {backend}: needs --pace realtime')
+
+
+def hardware_of(
+    backend: str | None, path: Path | None, configuration: Configuration
+) -> HardwareFile | None:
+    """Return the rig that the options ask for; on a real one valves move only if told so.
+
+    Raises ConfigurationError.
+    """
+    if backend is None:
+        return None
+    path = path or default_configuration().with_name('volts_calibration.yaml')
+    hardware = load_hardware(path)
+    units, valves = len(configuration.fam.count), len(hardware.calibration.valves)
+    if valves != units:
+        raise ConfigurationError(f'{path}: {valves} valves for {units} motor units; must be equal')
+    if backend not in SIMULATED and not agreed():
+        raise ConfigurationError(f'--backend {backend}: the valves were not told to move')
+    return hardware
+
+
+def agreed() -> bool:
+    """Ask whether valves may move; no without a terminal."""
+    if not sys.stdin.isatty():
+        return False
+    print('This moves the valves of a real rig. Go through docs/hardware.md first.')
+    return input("Type 'arm' to go on: ").strip() == 'arm'
