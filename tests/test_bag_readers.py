@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readers that share no code decode every message of a recorded run to the same values."""
+"""Our reader and three others decode every message of a recorded run to the same values."""
 
 import json
 import shutil
