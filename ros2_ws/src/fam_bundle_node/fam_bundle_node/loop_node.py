@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -30,6 +31,7 @@ from fam_bundle_node.ticks import Strikes, TickCounts, TickError, TickFilter, Ti
 RCLError = rclpy_implementation.RCLError
 # Parameter groups that every node of the loop declares.
 COMMON = ('run', 'process')
+LAST_MESSAGES = Duration(seconds=10)
 REPORT_PERIOD = 1.0  # s
 LOOK_PERIOD = 0.05  # s between two looks at how the node does
 SILENCE = 0.2  # s without a tick, after which a controller says what it waits for
@@ -54,6 +56,7 @@ class LoopNode(Node):
         self._order = TickOrder()
         self._strikes = Strikes()
         self._newest = 0  # steady time of a sample (ns)
+        self._publishers_of_loop: list[Publisher] = []
         try:
             self.configuration: Configuration = declare_configuration(self, (*groups, *COMMON))
         except ConfigurationError:
@@ -72,7 +75,17 @@ class LoopNode(Node):
     def loop_publisher(self, message_type: type, topic: str) -> Publisher:
         """Return a publisher for a topic of the loop."""
         quality = REALTIME_PUBLISHER if self.realtime else LOOP_PUBLISHER
-        return self.create_publisher(message_type, topic, quality)
+        publisher = self.create_publisher(message_type, topic, quality)
+        self._publishers_of_loop.append(publisher)
+        return publisher
+
+    def deliver(self) -> None:
+        """Wait until everybody has all that this node has published to the loop.
+
+        A recorder may be behind.
+        """
+        for publisher in self._publishers_of_loop:
+            publisher.wait_for_all_acked(LAST_MESSAGES)
 
     def loop_subscription(
         self, message_type: type, topic: str, callback: Callable[[Any], None]

@@ -57,6 +57,9 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
     done = first_done(nodes)
     try:
         spin(nodes, done)
+        if done.done() and done.result() == 0:
+            for node in nodes:
+                node.deliver()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except RuntimeError as error:
@@ -64,8 +67,9 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
         known = isinstance(error, rclpy_implementation.RCLError) or CUT_SHORT in str(error)
         if rclpy.ok() or not known:
             raise
-    for node in nodes:
-        node.close()
+    finally:
+        for node in nodes:
+            node.close()
     status: int = done.result() if done.done() else INTERRUPTED
     rclpy.try_shutdown()
     return status
