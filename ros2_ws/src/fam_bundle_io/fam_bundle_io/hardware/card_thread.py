@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from concurrent.futures import TimeoutError as NoAnswer  # another one than TimeoutError in 3.10
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -95,8 +96,8 @@ class CardThread:
         self._wake()
         try:
             return answer.result(timeout)
-        except TimeoutError:
-            if answer.done():
+        except NoAnswer:
+            if answer.done():  # what was asked for has raised it
                 raise
             raise TimeoutError(f'the card has not answered within {timeout:g} s') from None
 
