@@ -51,7 +51,7 @@ class NidaqmxBackend(Card):
     def _open(self) -> None:
         setup = self.setup
         options = make_group(NidaqmxOptions, 'backends.nidaqmx', setup.options)
-        self._ni = _import()
+        self._ni = import_vendor()
         self._failure = self._ni.errors.Error
         try:
             self._open_watchdog(setup, options)
@@ -171,7 +171,8 @@ class NidaqmxBackend(Card):
                 continue
 
 
-def _import() -> Any:
+def import_vendor() -> Any:
+    """Return the vendor's package with all modules of it that are used."""
     try:
         for module in MODULES:
             importlib.import_module(f'nidaqmx.{module}')

@@ -44,7 +44,7 @@ class QuanserBackend(Card):
     def _open(self) -> None:
         setup = self.setup
         options = make_group(QuanserOptions, 'backends.quanser', setup.options)
-        hardware, overflow = _import()
+        hardware, overflow = import_vendor()
         self._failure = hardware.HILError
         self._card = self._call(hardware.HIL, options.board_type, options.identifier)
         card, call = self._card, self._call
@@ -110,7 +110,7 @@ class QuanserBackend(Card):
                 continue
 
 
-def _import() -> tuple[Any, Any]:
+def import_vendor() -> tuple[Any, Any]:
     """Return the vendor's module and its overflow modes, which it does not re-export."""
     try:
         hardware: Any = importlib.import_module('quanser.hardware')
