@@ -25,6 +25,8 @@ FAULTS = {
     'input_open': 'the wire of an input is broken: it reads 0 V',
     'input_rail': 'an input is shorted to the upper end of its range',
     'input_frozen': 'an input keeps its volts',
+    'input_jumping': 'an input jumps to and fro within its live range',
+    'input_glitch': 'one sample of an input is 0 V',
     'inputs_swapped': 'the wires of two inputs are exchanged',
     'output_open': 'the wire of an output is broken: the amplifier sees 0 V',
     'output_rail': 'an output is shorted to the upper end of its range',
@@ -32,13 +34,23 @@ FAULTS = {
     'outputs_swapped': 'the wires of two outputs are exchanged',
     'valve_dead': 'the coil of a valve is dead: its spool goes to its own middle',
     'source_off': 'the source gives no pressure any more',
+    'source_high': 'the regulator of the source fails: it gives a quarter more',
     'read_timeout': 'no sample comes',
     'read_error': 'a read fails',
     'write_error': 'a write fails',
     'watchdog': "the card's watchdog expires if it runs",
 }
-OF_INPUTS = ('input_open', 'input_rail', 'input_frozen', 'inputs_swapped')
-OF_CARD = ('source_off', 'read_timeout', 'read_error', 'write_error', 'watchdog')
+OF_INPUTS = (
+    'input_open',
+    'input_rail',
+    'input_frozen',
+    'input_jumping',
+    'input_glitch',
+    'inputs_swapped',
+)
+SOURCE = {'source_off': 0.0, 'source_high': 1.25}  # over the nominal pressure
+OF_CARD = (*SOURCE, 'read_timeout', 'read_error', 'write_error', 'watchdog')
+JUMP = 0.4  # of its live range, by which a jumping input is off to either side of the middle
 
 
 class Scaling(Protocol):
@@ -103,18 +115,18 @@ class VoltsBackend:
             self._build()
         self.outputs = setup.safe_volts.copy()
         self.expired, self.configured = False, True
-        self._unwatched = 0.0
+        self._unwatched = 0  # periods since the watchdog was reloaded
         self._due = self._clock()
 
     def arm(self) -> None:
         """Start the watchdog; from here on ``write`` is allowed."""
         self._ready('arm')
-        self.armed, self._unwatched = True, 0.0
+        self.armed, self._unwatched = True, 0
 
     def read(self, volts: Array) -> None:
         """Let a period pass, and fill ``volts`` (inputs,) with what the card then sees."""
         self._ready('read', usable=False)
-        _check('read', volts, len(self.volts))
+        check_volts('read', volts, len(self.volts))
         self._pass_period()
         self._ready('read')
         for fault, code, words in (
@@ -129,7 +141,7 @@ class VoltsBackend:
     def write(self, volts: Array) -> None:
         """Put ``volts`` (outputs,) out; refused unless armed."""
         self._ready('write', armed=True)
-        _check('write', volts, len(self.outputs))
+        check_volts('write', volts, len(self.outputs))
         self._put_out(volts)
 
     def reload_watchdog(self) -> bool:
@@ -137,7 +149,7 @@ class VoltsBackend:
         if self.expired and self.armed:
             return False
         self._ready('reload_watchdog', armed=True)
-        self._unwatched = 0.0
+        self._unwatched = 0
         return True
 
     def make_safe(self) -> None:
@@ -172,19 +184,26 @@ class VoltsBackend:
         if fault == 'watchdog':
             self._expire()
             return
-        if fault == 'source_off':
-            self._set_source(0.0)
+        if fault in SOURCE:
+            self._set_source(SOURCE[fault])
         self.faults[fault] = channels
         self._frozen_inputs, self._frozen_outputs = self.volts.copy(), self.outputs.copy()
 
     def heal(self) -> None:
         """Mend everything; an expired watchdog is cleared by ``configure``."""
         self.faults.clear()
-        self._set_source(self.setup.configuration.source.nominal_pressure)
+        self._set_source(1.0)
 
     # ---- Inside ----
 
-    def _set_source(self, pressure: float) -> None:
+    def pressures(self) -> Array:
+        """Return the true pressure of each motor unit now, (units,) in Pa."""
+        found = np.empty(len(self.outputs))
+        self._truth(self.rig, self.state, found)
+        return found
+
+    def _set_source(self, share: float) -> None:
+        pressure = share * self.setup.configuration.source.nominal_pressure
         hydraulics = self.rig.hydraulics._replace(nominal_pressure=pressure)
         self.rig = self.rig._replace(hydraulics=hydraulics)
 
@@ -206,6 +225,7 @@ class VoltsBackend:
         self._pressures = self.values[CHANNELS:]
         self._current, self._spool = np.zeros(units), np.zeros(units)
         self._holds = self.options.hold
+        self._upward = False
         self._frozen_inputs, self._frozen_outputs = self.volts.copy(), np.zeros(units)
         self._substeps = configuration.simulation.substeps
         step = (self.rig, self.state.copy(), self._spool, period, self._substeps)
@@ -220,8 +240,8 @@ class VoltsBackend:
         if self.options.pace == 'steady':
             self._wait(round(period * 1e9))
         if self.armed and not self.expired:
-            self._unwatched += period
-            if self._unwatched > self.setup.watchdog_timeout:
+            self._unwatched += 1
+            if self._unwatched > round(self.setup.watchdog_timeout / period):
                 self._expire()
         if not self._holds:
             self._move_spools()
@@ -273,7 +293,18 @@ class VoltsBackend:
             self.volts[channel] = setup.input_maximum[channel]
         for channel in faults.get('input_frozen', ()):
             self.volts[channel] = before[channel]
+        for channel in faults.get('input_jumping', ()):
+            self.volts[channel] = self._jumped(channel)
+        for channel in faults.pop('input_glitch', ()):
+            self.volts[channel] = 0.0
         self._convert(self.volts, setup.input_minimum, setup.input_maximum)
+
+    def _jumped(self, channel: int) -> float:
+        self._upward = not self._upward
+        sensor = self.setup.calibration.sensors()[channel]
+        low, high = sensor.live_minimum, sensor.live_maximum
+        side = JUMP if self._upward else -JUMP
+        return float(0.5 * (low + high) + side * (high - low))
 
     def _put_out(self, volts: Array) -> None:
         if 'write_error' in self.faults:
@@ -305,7 +336,7 @@ class VoltsBackend:
             raise OSError(0, f'{call}: the card is not armed')
 
 
-def _check(call: str, volts: Array, size: int) -> None:
+def check_volts(call: str, volts: Array, size: int) -> None:
     """Raise OSError unless ``volts`` is what a vendor's wrapper would take."""
     good = volts.dtype == np.float64 and volts.shape == (size,) and volts.flags.c_contiguous
     if not good:

@@ -345,6 +345,8 @@ class Monitor:
 
 
 def _words(error: BaseException) -> str:
-    """Return an error in one line, with its type unless its words say enough."""
-    words = ' '.join(str(error).split())
-    return words if isinstance(error, OSError) and words else f'{type(error).__name__}: {words}'
+    """Return an error in one line: a card's with its code, any other with its type."""
+    if isinstance(error, OSError) and error.strerror:
+        code = f' (code {error.errno})' if error.errno else ''
+        return ' '.join(error.strerror.split()) + code
+    return f'{type(error).__name__}: ' + ' '.join(str(error).split())
