@@ -15,11 +15,20 @@ import pytest
 from ament_index_python.packages import get_package_prefix
 
 from fam_bundle_bringup.cli import parser
+from fam_bundle_io.hardware.calibration import (
+    FlowCalibration,
+    SensorCalibration,
+    ValveCalibration,
+)
+from fam_bundle_io.hardware.limits import Limits
+from fam_bundle_io.hardware.nidaqmx_backend import NidaqmxOptions
+from fam_bundle_io.hardware.quanser_backend import QuanserOptions
 from fam_bundle_io.trace import PER_UNIT, SCALARS
 from fam_bundle_model.lag_table import PHYSICS
 from fam_bundle_model.parameters import GROUPS
 from fam_bundle_model.schema import Declaration, declarations, required
 from fam_bundle_node.loop_node import COMMON
+from fam_bundle_sim.volts_backend import FAULTS, VoltsOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / 'ros2_ws' / 'src'
@@ -33,6 +42,15 @@ DOCUMENTS = sorted(
         *ROOT.glob('studies/**/*.md'),
     ]
 )
+HARDWARE_TABLES = {
+    '### backends.quanser': QuanserOptions,
+    '### backends.nidaqmx': NidaqmxOptions,
+    '### backends.volts': VoltsOptions,
+    '### sensors': SensorCalibration,
+    '### sensors.source_flow': FlowCalibration,
+    '### valves': ValveCalibration,
+    '## Limits': Limits,
+}
 CODE = re.compile(r'^(```|~~~).*?^\1|`[^`\n]*`', re.MULTILINE | re.DOTALL)
 LINK = re.compile(r'\]\(([^)\s]+)\)')
 HEADING = re.compile(r'^#+ +(.+)$', re.MULTILINE)
@@ -196,12 +214,24 @@ def test_every_parameter_group_and_no_other_has_a_table() -> None:
     assert re.findall(r'^### (\w+)$', text, re.MULTILINE) == list(GROUPS)
 
 
+@pytest.mark.parametrize(('heading', 'group'), HARDWARE_TABLES.items())
+def test_table_of_the_hardware_is_its_declaration(heading: str, group: type) -> None:
+    assert cells(ROOT / 'docs' / 'hardware.md', heading) == parameter_rows(group)
+
+
+def test_every_fault_of_the_simulated_rig_is_in_its_table() -> None:
+    rows = cells(ROOT / 'docs' / 'hardware.md', '#### Faults')
+    assert rows == [[name, text] for name, text in FAULTS.items()]
+
+
 # ---- Packages ----
 
 
 @pytest.mark.parametrize('package', PACKAGES)
 def test_module_table_names_every_module(package: str) -> None:
-    modules = {path.name for path in (SOURCE / package / package).glob('*.py')} - {'__init__.py'}
+    folder = SOURCE / package / package
+    modules = {str(path.relative_to(folder)) for path in folder.rglob('*.py')}
+    modules = {name for name in modules if not name.endswith('__init__.py')}
     named = [row[0] for row in cells(readme(package), '## Modules')]
     assert sorted(named) == sorted(modules)
 
