@@ -18,6 +18,7 @@ from fam_bundle_model.schema import (
     per_unit,
     positive,
     required,
+    word,
 )
 
 
@@ -32,6 +33,7 @@ class Rig:
     anything: float = number('Pa', 'any pressure', default=1.0)
     steps: int = integer('steps', 1, 9, default=3)
     mode: str = choice('mode', ('slow', 'fast'), default='slow')
+    label: str = word('label', default='none')
 
 
 GOOD = {'length': 2.0, 'share': 0.25, 'width': [0.1, 0.2], 'count': 2}
@@ -86,6 +88,8 @@ def test_text_that_is_a_number_counts_as_one():
         ({'count': [1, 5]}, 'rig.count[1] = 5: must be >= 1 and <= 4'),
         ({'count': [1, 1.5]}, 'rig.count[1] = 1.5: must be a whole number'),
         ({'count': [True]}, 'rig.count = True: must be >= 1 and <= 4'),
+        ({'label': ' '}, 'rig.label =  : must be text that is not blank'),
+        ({'label': 3}, 'rig.label = 3: must be text that is not blank'),
         ({'lenght': 1.0}, 'rig.lenght: no such parameter; did you mean rig.length?'),
         ({'zzz': 1.0}, 'rig.zzz: no such parameter'),
     ],
@@ -122,6 +126,7 @@ def test_only_parameters_without_default_are_required():
         'anything',
         'steps',
         'mode',
+        'label',
     ]
 
 

@@ -4,7 +4,9 @@
 import dataclasses
 import gc
 import math
+import re
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -522,6 +524,18 @@ def test_a_card_that_refuses_reads_does_not_spin_the_thread(spied, monkeypatch):
     spied.bench.backend.answer['read'] = refuses
     loop.ticks(10, None)
     assert naps == [PERIOD] * 10
+
+
+# ---- Documents ----
+
+
+def test_the_example_of_the_documents_runs(monkeypatch, capsys):
+    root = Path(__file__).parents[5]
+    monkeypatch.chdir(root)
+    document = (root / 'docs' / 'hardware.md').read_text(encoding='utf-8')
+    (example,) = re.findall(r'```python\n(.*?)```', document, re.DOTALL)
+    exec(example, {})
+    assert capsys.readouterr().out.startswith('State.INACTIVE [')
 
 
 # ---- Memory ----
