@@ -108,10 +108,7 @@ def read_bag(path: Path, topics: Callable[[str], bool] = lambda name: True) -> B
                     warnings.append(f'{error}')
     tables = {}
     for name, collector in collectors.items():
-        try:
-            tables[name] = collector.table()
-        except BagError as error:
-            warnings.append(f'{error}')
+        tables[name] = collector.table()
         warnings += collector.warnings
     warnings += _recovered(records.get('fam_bundle.recovery'))
     if not tables:
@@ -147,13 +144,15 @@ class _Collector:
         for name in cdr.types_within(self.type, self._store.fielddefs):
             if name not in self._store.fielddefs:
                 raise BagError(f'{self.topic}: the bag does not define its type {name}')
+        if cdr.holds_itself(self.type, self._store.fielddefs):
+            raise BagError(f'{self.topic}: its type {self.type} holds itself')
         self._check_hash(first.type_hash)
         self._waiting: dict[int, list[Messages]] = {}
         self._size, self._damaged, self._others = 0, 0, 0
         self._parts: dict[tuple[str, ...], list[tuple[np.ndarray, dict[str, np.ndarray]]]] = {}
 
     def add(self, messages: Messages) -> None:
-        """Take messages of one size; raises BagError when they cannot be decoded."""
+        """Take messages of one size."""
         if (messages.type, messages.definition) != (self.type, self.definition):
             self._others += len(messages.numbers)
             return
@@ -194,8 +193,6 @@ class _Collector:
     def _parts_of(self, data: np.ndarray) -> Iterable[cdr.Part]:
         try:
             return list(cdr.decode(data, self.type, self._store.fielddefs))
-        except RecursionError:
-            raise BagError(f'{self.topic}: its type {self.type} holds itself') from None
         except cdr.NotFlatError:
             return [self._objects(number, row.tobytes()) for number, row in enumerate(data)]
 
@@ -210,7 +207,7 @@ class _Collector:
         return cdr.Part(np.array([number]), columns)
 
     def table(self) -> 'pd.DataFrame':
-        """Return all rows in the order of the bag; raises BagError as ``add`` does."""
+        """Return all rows in the order of the bag."""
         import pandas as pd
 
         self._decode()

@@ -139,11 +139,24 @@ def types_within(name: str, types: Types) -> set[str]:
         if name in found:
             continue
         found.add(name)
-        for _, kind in types[name][1] if name in types else ():
-            element = kind[1][0] if kind[0] in (ARRAY, SEQUENCE) else kind
-            if element[0] == NAME:
-                waiting.append(element[1])
+        waiting += _types_in(name, types)
     return found
+
+
+def holds_itself(name: str, types: Types) -> bool:
+    """Return whether a message of type ``name``, or what is in it, never ends."""
+    return any(
+        outer in types_within(inner, types)
+        for outer in types_within(name, types)
+        for inner in _types_in(outer, types)
+    )
+
+
+def _types_in(name: str, types: Types) -> Iterator[str]:
+    for _, kind in types[name][1] if name in types else ():
+        element = kind[1][0] if kind[0] in (ARRAY, SEQUENCE) else kind
+        if element[0] == NAME:
+            yield element[1]
 
 
 class Part(NamedTuple):

@@ -72,7 +72,7 @@ class _Recoverer:
         self.ledgers: dict[str, TopicLedger] = {}
         self.records: dict[str, dict[str, str]] = {}
         self.damage: list[str] = []
-        self.count, self.others = 0, dict[str, int]()
+        self.count, self.timeless, self.others = 0, 0, dict[str, int]()
 
     def run(self) -> Recovery:
         try:
@@ -85,6 +85,8 @@ class _Recoverer:
             raise BagError('; '.join([f'{self.bag}: no messages', *self.damage]))
         for topic, count in self.others.items():
             self.damage.append(f'{topic}: {count} messages of another type are left out')
+        if self.timeless:
+            self.damage.append(f'{self.timeless} messages of no possible time are left out')
         summaries = {name: ledger.summary() for name, ledger in self.ledgers.items()}
         self.folder.close(self.records | self.said_of_itself(summaries))
         return Recovery(summaries, self.damage)
@@ -124,6 +126,9 @@ class _Recoverer:
         """Write one message."""
         data, sequence = messages.data[row].tobytes(), int(messages.sequences[row])
         received, published = int(messages.received[row]), int(messages.published[row])
+        if min(received, published) < 0:
+            self.timeless += 1
+            return
         self.folder.write(Item(messages.topic, received, published, sequence, data))
         self.ledgers[messages.topic].note(sequence, data)
         self.count += 1
