@@ -2,18 +2,16 @@
 """Whatever happens to a bag: an error in one line, or what it held, or a warning."""
 
 import contextlib
-import importlib.util
 import random
 import resource
 import shutil
 import sqlite3
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
+import damage
 import numpy as np
 import pandas as pd
 import pytest
@@ -28,17 +26,6 @@ PATIENCE = 20.0  # s; only a hang takes that long
 MEMORY = 1 << 30  # bytes that reading one of these bags of 0.3 MB may ask for
 
 
-def _load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, Path(__file__).with_name(f'{name}.py'))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-damage = _load('damage')
 Make = Callable[[str], Path]
 
 
@@ -55,7 +42,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Make:
     return make
 
 
-Truth = Callable[['damage.Case'], dict[str, pd.DataFrame]]
+Truth = Callable[[damage.Case], dict[str, pd.DataFrame]]
 
 
 @pytest.fixture(scope='module')
@@ -63,7 +50,7 @@ def truth(whole: Make, tmp_path_factory: pytest.TempPathFactory) -> Truth:
     """Return what gives the tables of a case's bag as it was before, by time of receipt."""
     known: dict[tuple[str, int], dict[str, pd.DataFrame]] = {}
 
-    def tables(case: 'damage.Case') -> dict[str, pd.DataFrame]:
+    def tables(case: damage.Case) -> dict[str, pd.DataFrame]:
         key = (case.of, id(case.items))
         if key not in known:
             bag = whole(case.of)
@@ -154,7 +141,7 @@ def assert_one_line(error: BagError) -> None:
     assert '\n' not in str(error)
 
 
-def assert_honest(bag: Bag, case: 'damage.Case', true: dict[str, pd.DataFrame]) -> None:
+def assert_honest(bag: Bag, case: damage.Case, true: dict[str, pd.DataFrame]) -> None:
     assert all(words and '\n' not in words for words in bag.warnings)
     wrong = {name: wrong_rows(table, true.get(name)) for name, table in bag.tables.items()}
     if case.checked:
