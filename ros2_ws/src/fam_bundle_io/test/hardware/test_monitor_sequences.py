@@ -148,10 +148,10 @@ class Bridge(RuleBasedStateMachine):
             self.spool, self.stamp = np.array([0.0, bad]), self.clock()
             self.tick()
 
-    @rule(ahead=st.integers(1, 10**9))
-    def command_from_the_future(self, ahead):
+    @rule(ahead=st.integers(1, 10**9), count=st.sampled_from([1, 30, 130]))
+    def command_from_the_future(self, ahead, count):
         self.spool, self.stamp = np.array([1.0, 1.0]), self.clock() + ahead
-        self.tick()
+        self.hold(count)
 
     @precondition(lambda self: self.monitor.state is not State.UNCONFIGURED)
     @rule(error=st.sampled_from([KeyboardInterrupt, SystemExit, MemoryError, TypeError]))
