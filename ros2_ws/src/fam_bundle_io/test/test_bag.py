@@ -12,6 +12,7 @@ import pytest
 
 from fam_bundle_io import completeness
 from fam_bundle_io.bag import read_bag
+from fam_bundle_io.bag_files import read_parts
 from fam_bundle_io.bag_writer import BagError, BagWriter, Item, Topic
 from fam_bundle_io.message_definitions import complete_definition, types_in
 
@@ -121,6 +122,36 @@ def test_a_bag_rotates_by_size_and_is_read_as_one(tmp_path: Path) -> None:
     write(tmp_path / 'bag', 20_000, split_size=100_000)
     assert len(list((tmp_path / 'bag').glob('*.mcap'))) > 1
     assert_whole(tmp_path / 'bag', 20_000)
+
+
+def test_a_bag_rotates_by_time_and_is_read_as_one(tmp_path: Path) -> None:
+    types, writer = store(), BagWriter(tmp_path / 'bag', split_duration=0.5)
+    writer.add_topic(Topic('/sample', TYPE, DEFINITION, 'RIHS01_0'))
+    for tick in range(2000):
+        time = 10**18 + 1_000_000 * tick
+        writer.write(Item('/sample', time, time - 5, tick + 1, sample(types, tick)))
+    writer.close(lambda: {'some.record': {'key': 'value'}})
+    assert_whole(tmp_path / 'bag', 2000)
+    for number in range(4):
+        ticks = read_bag(tmp_path / 'bag' / f'bag_{number}.mcap').tables['/sample']['tick']
+        assert list(ticks) == list(range(500 * number, 500 * number + 500))
+
+
+def test_what_shaped_a_run_stands_at_the_head_of_each_file(tmp_path: Path) -> None:
+    types = store()
+    writer = BagWriter(tmp_path / 'bag', split_size=1, head={'some.record': {'key': 'value'}})
+    writer.add_topic(Topic('/sample', TYPE, DEFINITION))
+    for tick in range(5000):
+        writer.write(Item('/sample', tick, tick, 0, sample(types, tick)))
+    writer.close()
+    files = list((tmp_path / 'bag').glob('*.mcap'))
+    assert len(files) > 1
+    for file in files:
+        content = file.read_bytes()
+        file.write_bytes(content[: content.index(b'value') + 100])  # a crash soon after
+        with pytest.raises(BagError, match='cut short after 0 messages'):
+            read_bag(file)
+        assert {'some.record': {'key': 'value'}} in list(read_parts(file))
 
 
 def test_sqlite_is_read_like_mcap(bag: Path, tmp_path: Path) -> None:
