@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from fam_bundle_bringup.graph import own_domain, run_graph
+from fam_bundle_bringup.offline import run_offline
 from fam_bundle_bringup.processes import executable
 from fam_bundle_io.bag import read_bag, trace_of
 from fam_bundle_model.parameters import Configuration
@@ -27,9 +28,10 @@ def test_a_recorded_run_gives_its_trace_to_the_last_bit(
     assert bag.warnings == []
     run = trace_of(bag)
     assert run.warnings == []
-    assert set(run.trace) == set(trace)
-    for name, values in trace.items():
-        assert run.trace[name].tobytes() == values.tobytes(), name
+    offline = run_offline(configuration)  # without the graph, the recorder and the bag
+    assert set(run.trace) == set(trace) == set(offline)
+    for name, values in offline.items():
+        assert run.trace[name].tobytes() == trace[name].tobytes() == values.tobytes(), name
     completeness = bag.records['fam_bundle.completeness']
     assert json.loads(completeness['whole']) is True
     for topic in LOOP:

@@ -14,7 +14,9 @@ from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.processes import NodeDied, NodeGroup, executable
 from fam_bundle_bringup.this_machine import stay_on_this_machine
-from fam_bundle_io.trace import Trace
+from fam_bundle_io.bag import read_bag, trace_of
+from fam_bundle_io.bag_writer import BagError
+from fam_bundle_io.trace import Trace, empty_trace
 from fam_bundle_model.parameters import Configuration, write_yaml
 
 if TYPE_CHECKING:
@@ -92,17 +94,17 @@ def run_graph(
     With ``bridge`` the hardware bridge takes the place of the plant simulator.
 
     The nodes' parameter file, what they print and their loop statistics go to ``folder``, and to
-    ``folder / 'bag'`` all topics if they are to be recorded.
+    ``folder / 'bag'`` all topics if they are to be recorded; the trace is then made of the bag.
     ``progress`` is called with the ticks done so far. Raises RunFailed when a node ends early or
     messages stay missing; in real time, where samples may be skipped, when none came through.
     """
     parameter_file = folder / 'parameters.yaml'
     write_yaml(configuration, parameter_file)
     failure = None
-    with own_domain(), recording() as ((recorder,), listen):
+    with own_domain(), recording(keep=not record) as ((recorder,), listen):
         with nodes_in(folder) as group:
             bag = start_bag_recorder(group, parameter_file, folder / 'bag') if record else None
-            listeners = LOOP_LISTENERS + 1 + record
+            listeners = LOOP_LISTENERS + 1
             owner = start_nodes(group, parameter_file, listeners, composed=composed, bridge=bridge)
             try:
                 while not group.finished(owner):
@@ -114,7 +116,8 @@ def run_graph(
                     close_bag(bag, folder)
             except NodeDied as error:
                 failure = str(error)
-        trace = recorder.trace(len(configuration.fam.count))
+        units = len(configuration.fam.count)
+        trace = trace_in(folder / 'bag', units) if record else recorder.trace(units)
         write_json(recorder.reports(), folder / 'loop_statistics.json')
     recorded, wanted = len(trace['time']), configuration.ticks()
     if configuration.run.pace == 'realtime':
@@ -124,6 +127,14 @@ def run_graph(
     if failure is not None:
         raise RunFailed(f'{failure} ({recorded} ticks are kept)', trace)
     return trace
+
+
+def trace_in(bag: Path, units: int) -> Trace:
+    """Return the trace of the run in a bag, an empty one where there is none."""
+    try:
+        return trace_of(read_bag(bag)).trace
+    except BagError:
+        return empty_trace(0, units)
 
 
 def start_bag_recorder(
@@ -172,17 +183,18 @@ def nodes_in(folder: Path) -> NodeGroup:
 
 @contextlib.contextmanager
 def recording(
-    bundles: Sequence[str] = ('',),
+    bundles: Sequence[str] = ('',), *, keep: bool = True
 ) -> Iterator[tuple[list['TraceRecorder'], Callable[[float], None]]]:
     """Give a trace recorder for each of ``bundles``, and a function that listens for some seconds.
 
-    A bundle is named by its namespace; all recorders are in this process.
+    A bundle is named by its namespace; all recorders are in this process, and ``keep`` messages or
+    only the loop statistics.
     """
 
     def make() -> list['TraceRecorder']:
         from fam_bundle_io.trace_recorder_node import TraceRecorder
 
-        return [TraceRecorder(bundle) for bundle in bundles]
+        return [TraceRecorder(bundle, keep=keep) for bundle in bundles]
 
     with listening(make) as found:
         yield found

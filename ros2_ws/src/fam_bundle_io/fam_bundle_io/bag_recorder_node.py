@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS node that records the topics of a bundle as a rosbag2 bag."""
 
+import dataclasses
 import fnmatch
 import importlib
 import importlib.metadata
@@ -35,14 +36,16 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from fam_bundle_io.bag_writer import BagError, BagWriter, Item, Topic
 from fam_bundle_io.completeness import TopicLedger, carries_tick, record_of, shortcomings
 from fam_bundle_io.message_definitions import complete_definition
-from fam_bundle_model.parameters import GROUPS, Configuration, yaml_text
+from fam_bundle_model.parameters import GROUPS, Configuration, ProcessParameters, yaml_text
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.declare import declare_configuration
+from fam_bundle_node.tuning import tune
 
 POLL_PERIOD = 0.01  # s between two times that messages are taken
 LOOK_PERIOD = 0.05  # s between two looks at what topics there are
 SILENCE = 0.2  # s without a message, after which all that was published has come
 DRAIN_TIMEOUT = 5.0  # s
+PRIORITY_BELOW = 10  # that of the nodes of the loop
 DEPTH = 10_000  # messages of a topic that may wait for this node
 # The plant waits for its listeners, so this node becomes one when it has the others.
 STARTS_THE_RUN = 'bundle_state'
@@ -327,6 +330,15 @@ def record_until_told(recorder: BagRecorder, told: Callable[[], bool]) -> None:
         executor.shutdown()
 
 
+def below_the_loop(process: ProcessParameters) -> ProcessParameters:
+    """Return how a recorder runs beside nodes that run like ``process``.
+
+    With a priority of theirs they would starve it; with the same it would hold them up.
+    """
+    priority = max(process.priority - PRIORITY_BELOW, 1) if process.priority else 0
+    return dataclasses.replace(process, priority=priority)
+
+
 def main() -> None:
     """Record until a signal ends it: status 0, 1 when the disk failed, 2 for a bad parameter."""
     # The signal must not take the middleware away: what is under way still has to be written.
@@ -350,6 +362,9 @@ def run(told: Callable[[], bool]) -> int:
         return 2
     log, folder = recorder.get_logger(), recorder.writer.folder
     log.info(f'recording to {folder}')
+    if recorder.configuration is not None:
+        for warning in tune(below_the_loop(recorder.configuration.process), 'realtime'):
+            log.warning(warning)
     try:
         record_until_told(recorder, told)
     finally:

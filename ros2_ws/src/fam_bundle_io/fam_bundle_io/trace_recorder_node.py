@@ -33,14 +33,19 @@ TOPICS = {
 class TraceRecorder(Node):
     """Takes the messages as bytes, for the loop runs while it listens; decodes them later."""
 
-    def __init__(self, namespace: str = '') -> None:
-        """Listen to the answers; to the plant, which starts the run, when these are matched."""
+    def __init__(self, namespace: str = '', *, keep: bool = True) -> None:
+        """Listen to the answers; to the plant, which starts the run, when these are matched.
+
+        Without ``keep`` only to the loop statistics: somebody else keeps the messages.
+        """
         super().__init__('trace_recorder', namespace=namespace)
         self.raw: dict[str, list[bytes]] = {topic: [] for topic in TOPICS}
         self.statistics: list[LoopStatistics] = []
         self.create_subscription(
             LoopStatistics, 'loop_statistics', self.statistics.append, REPORTS
         )
+        if not keep:
+            return
         for topic in TOPICS:
             if topic != 'bundle_state':
                 self.listen(topic)
@@ -59,8 +64,9 @@ class TraceRecorder(Node):
         self.create_subscription(TOPICS[topic], topic, keep, RECORDER_SUBSCRIPTION, raw=True)
 
     def samples(self) -> int:
-        """Return how many samples of the plant have come."""
-        return len(self.raw['bundle_state'])
+        """Return how many samples of the plant have come, or been reported where none is kept."""
+        reported = max((report.ticks for report in self.statistics), default=0)
+        return len(self.raw['bundle_state']) or reported
 
     def messages(self) -> int:
         """Return how many messages of the loop have come."""
@@ -68,7 +74,7 @@ class TraceRecorder(Node):
 
     def is_behind(self) -> bool:
         """Return whether answers to samples that have come are still missing."""
-        return any(len(raw) < self.samples() for raw in self.raw.values())
+        return any(len(raw) < len(self.raw['bundle_state']) for raw in self.raw.values())
 
     def trace(self, units: int) -> Trace:
         """Return the trace of all ticks that came on every topic, each at its first coming."""
