@@ -280,7 +280,8 @@ def trace_of(bag: Bag, namespace: str = '', run: int = -1) -> Run:
     A topic that the bag misses leaves NaN. Raises BagError without ``bundle_state``.
     """
     tables, warnings = run_tables(bag, namespace, run)
-    ticks = functools.reduce(np.intersect1d, (table.index for table in tables.values()))
+    common = functools.partial(np.intersect1d, assume_unique=True)
+    ticks = functools.reduce(common, (table.index.to_numpy() for table in tables.values()))
     if not len(ticks):
         raise BagError('no tick is on every topic of the loop')
     first, last = int(ticks[0]), int(ticks[-1])

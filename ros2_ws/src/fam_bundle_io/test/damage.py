@@ -94,7 +94,7 @@ def loop(ticks: Iterable[int] = range(TICKS), begin: int = START) -> Iterator[It
             yield Item(topic, published + 50_000, published, row + 1, message(kind, tick))
 
 
-def _with_tick(item: Item, tick: int) -> Item:
+def with_tick(item: Item, tick: int) -> Item:
     """Return the message with another tick; all its other numbers stay."""
     at = 4 + 24  # behind the header
     return item._replace(data=item.data[:at] + tick.to_bytes(8, 'little') + item.data[at + 8 :])
@@ -103,7 +103,7 @@ def _with_tick(item: Item, tick: int) -> Item:
 ITEMS = list(loop())
 # Another run a minute later, with other numbers at the same ticks.
 SECOND = [
-    _with_tick(item, row // len(TYPES))
+    with_tick(item, row // len(TYPES))
     for row, item in enumerate(loop(range(5000, 5000 + TICKS), START + 60 * 10**9))
 ]
 
@@ -113,15 +113,16 @@ def write_bag(
     items: Iterable[Item] = ITEMS,
     topics: dict[str, Topic] | None = None,
     split: float = 0.0,
+    chunk: int = CHUNK,
 ) -> Path:
-    """Write a bag as the recorder does, with a chunk for each ``CHUNK`` ticks."""
+    """Write a bag as the recorder does, with a chunk for each ``chunk`` ticks."""
     topics = topics or TOPICS
     bag = BagFolder(folder, head={'fam_bundle.provenance': {'seed': '1'}}, split_duration=split)
     for topic in topics.values():
         bag.add_topic(topic)
     for count, item in enumerate(items):
         bag.write(item)
-        if count % (CHUNK * len(TYPES)) == 0:
+        if chunk and count % (chunk * len(TYPES)) == 0:
             bag.sync()
     bag.close({'fam_bundle.completeness': {'whole': 'true'}})
     return folder
