@@ -135,3 +135,24 @@ def shortcomings(summaries: Mapping[str, dict[str, Any]], dropped: int) -> Itera
             yield f'{topic}: {summary["missing_ticks"]} ticks without a message ({gaps})'
         if summary.get('without_tick'):
             yield f'{topic}: {summary["without_tick"]} messages too short to carry a tick'
+    yield from _ends(summaries)
+
+
+def _ends(summaries: Mapping[str, dict[str, Any]]) -> Iterator[str]:
+    """Yield which topics of a bundle begin later or end earlier than the others.
+
+    That shows neither in their own ticks nor in their sequence numbers.
+    """
+    bundles: dict[str, dict[str, tuple[int, int]]] = {}
+    for topic, summary in summaries.items():
+        if summary.get('last_tick', -1) >= 0:
+            ends = summary['first_tick'], summary['last_tick']
+            bundles.setdefault(topic.rpartition('/')[0], {})[topic] = ends
+    for topics in bundles.values():
+        first = min(begin for begin, _ in topics.values())
+        last = max(end for _, end in topics.values())
+        for topic, (begin, end) in topics.items():
+            if begin > first:
+                yield f'{topic}: begins with tick {begin}, the others with {first}'
+            if end < last:
+                yield f'{topic}: ends with tick {end}, the others with {last}'

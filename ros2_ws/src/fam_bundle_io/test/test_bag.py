@@ -301,6 +301,11 @@ def test_the_ledger_counts_gaps_repeats_and_runs() -> None:
     assert ledger_of([0, 1, 1, 2])['repeated_ticks'] == 1
     assert ledger_of([0, 1, 2], [1, 2, 5])['lost'] == 2
     assert ledger_of([0, 1, 2], [8, 9, 1])['lost'] == 0
+    early = list(completeness.shortcomings({'/x': whole, '/y': ledger_of([0, 1])}, 0))
+    assert early == ['/y: ends with tick 1, the others with 3']
+    late = list(completeness.shortcomings({'/x': whole, '/y': ledger_of([2, 3])}, 0))
+    assert late == ['/y: begins with tick 2, the others with 0']
+    assert not list(completeness.shortcomings({'/a/x': whole, '/b/x': ledger_of([0, 1])}, 0))
     words = list(completeness.shortcomings({'/x': gap}, 4))
     assert words[0].startswith('4 messages dropped')
     assert words[1] == '/x: 3 ticks without a message (2-3, 6)'
