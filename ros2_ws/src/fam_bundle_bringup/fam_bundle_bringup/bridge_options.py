@@ -30,15 +30,20 @@ def add_bridge_options(command: argparse.ArgumentParser) -> None:
     )
 
 
+def check_backend_name(backend: str) -> None:
+    """Raise ConfigurationError unless ``backend`` is registered."""
+    if backend not in backend_names():
+        known = ', '.join(backend_names())
+        raise ConfigurationError(f'--backend {backend}: not known; there are: {known}')
+
+
 def check_backend(backend: str | None, options: argparse.Namespace) -> None:
     """Raise ConfigurationError where options do not fit together for a hardware bridge."""
     if backend is None:
         if options.hardware is not None:
             raise ConfigurationError('--hardware: of which card? name it with --backend')
         return
-    if backend not in backend_names():
-        known = ', '.join(backend_names())
-        raise ConfigurationError(f'--backend {backend}: not known; there are: {known}')
+    check_backend_name(backend)
     if options.composed:
         raise ConfigurationError('--backend: not with --composed')
     if options.pace == 'offline':

@@ -21,16 +21,11 @@ from fam_bundle_bringup.experiment import (
     default_configuration,
     prepare_folder,
 )
+from fam_bundle_bringup.one_line_parser import Parser
+from fam_bundle_bringup.rig_commands import NAMES as RIG_COMMANDS
+from fam_bundle_bringup.rig_commands import add_rig_commands, run_rig_command
 from fam_bundle_model.parameters import SCHEMES, Configuration
 from fam_bundle_model.schema import ConfigurationError
-
-
-class Parser(argparse.ArgumentParser):
-    """A parser that refuses in one line."""
-
-    def error(self, message: str) -> Any:
-        """Print one line and exit with status 2."""
-        self.exit(2, f'{self.prog}: {message}; see {self.prog} --help\n')
 
 
 def parser() -> Parser:
@@ -58,6 +53,7 @@ def parser() -> Parser:
     faults.add_argument('--only', default='', metavar='TEXT', help='faults that contain TEXT')
     _add_top(commands)
     add_bag_commands(commands)
+    add_rig_commands(commands)
     return top
 
 
@@ -247,6 +243,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         if options.command in BAG_COMMANDS:
             return run_bag_command(options)
+        if options.command in RIG_COMMANDS:
+            return run_rig_command(options)
         results = RESULTS if options.command == 'experiment' else ()
         changes = changes_of(options) if options.command == 'experiment' else {}
         if options.command == 'experiment' and options.composed and options.pace == 'offline':
