@@ -29,7 +29,7 @@ from fam_bundle_sim.volts_backend import VoltsBackend
 ROOT = Path(__file__).resolve().parents[1]
 VOLTS = default_configuration().with_name('volts_calibration.yaml')
 TEMPLATE = default_configuration().with_name('hardware_calibration_template.yaml')
-SAFE = [-9.375, -9.375]  # of the simulated rig: its middle less full scale
+SAFE = -9.375  # V, of each valve of the simulated rig: its middle less full scale
 LIMIT = 200e3  # Pa, if not told otherwise
 
 Capture = pytest.CaptureFixture[str]
@@ -57,13 +57,13 @@ class WatchedRig(VoltsBackend):
         pressures = np.empty(len(self.outputs))
         truth(self.rig, self.state, pressures)
         self.peak = max(self.peak, float(pressures.max()))
-        self.moved = self.moved or self.outputs.tolist() != SAFE
+        self.moved = self.moved or set(self.outputs) != {SAFE}
         self.samples += 1
         if self.samples in self.at_sample:
             self.at_sample[self.samples](self)
 
     def is_left_safe(self) -> bool:
-        return not self.configured and self.outputs.tolist() == SAFE
+        return not self.configured and set(self.outputs) == {SAFE}
 
 
 class ReversedRig(WatchedRig):
@@ -155,7 +155,7 @@ def test_a_healthy_rig_passes_and_no_unit_gets_far(on: Any, capsys: Capture) -> 
                 'motor unit 1: swapped: valves[1] (output 1) is answered by mu_pressure[0]',
             ),
         ),
-        (('inputs_swapped', 2, 5), ('swapped with source_pressure',)),
+        (('inputs_swapped', 2, 5), ('swapped with that of source_pressure',)),
         (('inputs_swapped', 0, 4), ('mu_pressure[0] = -1.19 V',)),
         (('valve_dead', 0), ('motor unit 0: dead: valves[0] (output 0)', 'motor unit 1: ok')),
         (('valve_dead', 1), ('motor unit 0: ok', 'motor unit 1: dead: valves[1] (output 1)')),
@@ -230,6 +230,49 @@ def test_a_worn_noisy_rig_passes_and_its_middle_is_noticed(
     rig = WatchedRig(('outputs_swapped', 0, 1))
     assert on(rig, 'check-channels', *files) == 1
     assert capsys.readouterr().out.count(': swapped: ') == 2
+    assert rig.peak <= LIMIT and rig.is_left_safe()
+
+
+@pytest.mark.parametrize('pressure', ['100', '350'])
+@pytest.mark.parametrize('mass', [5.0, 35.0])
+def test_a_healthy_rig_passes_with_any_load_and_limit(
+    mass: float, pressure: str, on: Any, tmp_path: Path, capsys: Capture
+) -> None:
+    def load(content: Any) -> None:
+        content['/**']['ros__parameters']['load']['mass'] = mass
+        content['/**']['ros__parameters']['reference']['amplitude'] = 0.01
+
+    config = edited(default_configuration(), tmp_path / 'config.yaml', load)
+    rig = WatchedRig()
+    options = ('--config', config, '--pressure', pressure)
+    assert on(rig, 'check-channels', *options) == 0, capsys.readouterr()
+    assert rig.peak <= 1e3 * float(pressure) and rig.is_left_safe()
+    rig = WatchedRig()
+    rig.at_sample[1000] = lambda broken: broken.inject('valve_dead', 1)  # it hangs at rest
+    assert on(rig, 'check-channels', *options) == 1
+    assert 'motor unit 1: dead' in capsys.readouterr().out
+
+
+def test_the_two_that_are_swapped_are_named_among_three(
+    on: Any, tmp_path: Path, capsys: Capture
+) -> None:
+    def add_unit(content: Any) -> None:
+        content['/**']['ros__parameters']['fam']['count'] = [1, 1, 2]
+
+    def add_channels(content: Any) -> None:
+        pressures, valves = content['sensors']['mu_pressure'], content['valves']
+        pressures.append({**pressures[0], 'channel': 11})
+        valves.append({**valves[0], 'channel': 7})
+
+    config = edited(default_configuration(), tmp_path / 'three.yaml', add_unit)
+    hardware = edited(VOLTS, tmp_path / 'hardware.yaml', add_channels)
+    rig = WatchedRig(('outputs_swapped', 0, 2))
+    assert on(rig, 'check-channels', '--config', config, '--hardware', hardware) == 1
+    said = capsys.readouterr().out
+    assert 'unit 0: swapped: valves[0] (output 0) is answered by mu_pressure[2] (input 11)' in said
+    assert 'unit 1: ok: ' in said
+    assert 'unit 2: swapped: valves[2] (output 7) is answered by mu_pressure[0] (input 4)' in said
+    assert '2 of 3 motor units' in said
     assert rig.peak <= LIMIT and rig.is_left_safe()
 
 

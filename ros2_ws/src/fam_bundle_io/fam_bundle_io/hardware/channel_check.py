@@ -274,7 +274,10 @@ class ChannelCheck:
         highest, source = sample.values[MU_PRESSURE:].max(), sample.values[SOURCE_PRESSURE]
         if not sample.valid or highest <= source + self.limits.overpressure_margin:
             return ''
-        return '; no unit is fed above its source: is its wire swapped with source_pressure?'
+        return (
+            '; no source feeds that: its valve traps oil under the load, or its wire is swapped '
+            'with that of source_pressure'
+        )
 
     def _report(self, sample: Sample, line: str) -> None:
         if sample.time * 1e-9 - self._told >= REPORT_TIME:
