@@ -11,6 +11,7 @@ from fam_bundle_io.bag_writer import BagError
 from fam_bundle_model.parameters import Configuration, load_configuration
 
 NAMES = ('report', 'replay', 'recover')
+PACKAGES = ('mcap', 'rosbags', 'zstandard', 'pandas', 'plotly')  # that only bags need
 
 
 def add_bag_commands(commands: Any) -> None:
@@ -67,6 +68,11 @@ def run_bag_command(options: argparse.Namespace) -> int:
         return run_recover(options.bag, options.out)
     except BagError as error:
         print(f'fam {options.command}: {error}', file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        package = str(error.name).partition('.')[0]
+        words = f'Python package {package} is missing: pip install {" ".join(PACKAGES)}'
+        print(f'fam {options.command}: {words}', file=sys.stderr)
         return 2
 
 

@@ -2,6 +2,7 @@
 """The command line: what ``./fam`` passes on."""
 
 import argparse
+import importlib.util
 import math
 import signal
 import sys
@@ -51,6 +52,11 @@ def parser() -> Parser:
     )
     _add_common(faults, Path('runs/faults'))
     faults.add_argument('--only', default='', metavar='TEXT', help='faults that contain TEXT')
+    faults.add_argument(
+        '--backend',
+        choices=('volts',),
+        help='those of the hardware bridge, on the simulated rig in volts',
+    )
     _add_top(commands)
     add_bag_commands(commands)
     add_rig_commands(commands)
@@ -226,7 +232,9 @@ def run_command(options: argparse.Namespace, configuration: Configuration) -> in
     else:
         from fam_bundle_bringup.faults import run_faults
 
-        return 0 if run_faults(configuration, options.out, options.only) else 1
+        bridge = options.backend is not None
+        passed = run_faults(configuration, options.out, options.only, bridge=bridge)
+        return 0 if passed else 1
     return 0
 
 
@@ -254,6 +262,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.command == 'experiment' and options.record:
             if options.pace == 'offline':
                 raise ConfigurationError('--record: --pace offline has no topics to record')
+            if importlib.util.find_spec('mcap') is None:
+                raise ConfigurationError(
+                    '--record: needs the Python package mcap: pip install mcap'
+                )
             if (options.out / 'bag').exists():
                 raise ConfigurationError(f'--record: {options.out}/bag exists: name another --out')
         config = options.config or default_configuration()

@@ -2,6 +2,7 @@
 """The paper's experiment under every scheme: Table 2, its figures, and how alike they are."""
 
 import dataclasses
+import importlib.util
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,13 +32,14 @@ def run_demo(configuration: Configuration, folder: Path) -> None:
     for name in ('table2.json', 'shapes.json'):  # no numbers of an earlier call beside new ones
         (folder / name).unlink(missing_ok=True)
     results: dict[str, Result] = {}
+    record = importlib.util.find_spec('mcap') is not None
     for scheme in SCHEMES:
         recruitment = dataclasses.replace(configuration.recruitment, scheme=scheme)
         one = dataclasses.replace(configuration, recruitment=recruitment)
         with progress_bar(f'{scheme}, through the graph', one.ticks()) as progress:
             remove_bag(folder / scheme / 'bag')
             results[scheme] = run_experiment(
-                one, 'lockstep', folder / scheme, progress, record=True
+                one, 'lockstep', folder / scheme, progress, record=record
             )
     tracked = {scheme: _tracking(result) for scheme, result in results.items()}
     table = {scheme: tracked[scheme]._asdict() for scheme in PAPER}
@@ -55,7 +57,10 @@ def run_demo(configuration: Configuration, folder: Path) -> None:
     print_table(tracked, rival)
     print_claims(claims)
     print(f'{len(figures)} figures and all results in {folder}')
-    print(f'explore the runs: ./fam report {folder}/*/bag --out {folder / "report"}')
+    if record:
+        print(f'explore the runs: ./fam report {folder}/*/bag --out {folder / "report"}')
+    else:
+        print('no bags were kept, for the Python package mcap is missing')
 
 
 def remove_bag(bag: Path) -> None:

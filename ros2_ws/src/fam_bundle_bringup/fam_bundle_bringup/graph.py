@@ -14,7 +14,6 @@ from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.processes import NodeDied, NodeGroup, executable
 from fam_bundle_bringup.this_machine import stay_on_this_machine
-from fam_bundle_io.bag import read_bag, trace_of
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_io.trace import Trace, empty_trace
 from fam_bundle_model.parameters import Configuration, write_yaml
@@ -131,6 +130,8 @@ def run_graph(
 
 def trace_in(bag: Path, units: int) -> Trace:
     """Return the trace of the run in a bag, an empty one where there is none."""
+    from fam_bundle_io.bag import read_bag, trace_of
+
     try:
         return trace_of(read_bag(bag)).trace
     except BagError:
