@@ -422,3 +422,15 @@ def test_the_lock_of_npm_pins_with_hashes_and_holds_no_address():
 
 def test_fam_is_executable():
     assert os.stat(REPOSITORY / 'fam').st_mode & stat.S_IXUSR
+
+
+def test_the_set_up_does_not_run_in_the_environment_that_it_may_remove(tree, monkeypatch):
+    module, started = tree.module(), []
+    monkeypatch.setattr(os, 'execv', lambda *words: started.append(words))
+    module.leave_own_venv()
+    assert started == []
+    monkeypatch.setattr(sys, 'prefix', str(module.VENV))
+    monkeypatch.setattr(sys, 'argv', ['fam', 'setup'])
+    module.leave_own_venv()
+    python = os.path.realpath(sys.executable)
+    assert started == [(python, [python, str(tree.root / 'fam'), 'setup'])]
