@@ -22,9 +22,11 @@ setup(
     entry_points={
         'console_scripts': [
             'plant_simulator = fam_bundle_sim.plant_simulator_node:main',
+            'volts_card = fam_bundle_sim.volts_card:main',
         ],
         'fam_bundle.backends': [
             'volts = fam_bundle_sim.volts_backend:VoltsBackend',
+            'volts_card = fam_bundle_sim.volts_card:VoltsCard',
         ],
     },
 )

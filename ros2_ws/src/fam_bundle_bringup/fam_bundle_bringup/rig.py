@@ -55,6 +55,10 @@ class Report(NamedTuple):
 class Rig:
     """Five nodes in real time, each a process of its own, and a listener in this process."""
 
+    packages: Mapping[str, str] = PACKAGES
+    listeners = LOOP_LISTENERS + 1  # of bundle_state
+    topics = ('bundle_state', 'valve_command')  # all would cost the loop too much
+
     def __init__(self, configuration: Configuration, folder: Path) -> None:
         """Keep the parameters and what the nodes print in ``folder``; start nothing yet."""
         folder.mkdir(parents=True, exist_ok=True)
@@ -104,7 +108,7 @@ class Rig:
         from fam_bundle_node.qos import REPORTS
 
         self.node = node
-        for topic in ('bundle_state', 'valve_command'):  # all would cost the loop too much
+        for topic in self.topics:
             self.watch(topic)
         node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, REPORTS)
 
@@ -153,15 +157,15 @@ class Rig:
     ) -> None:
         """Start the node ``name``, behind the command ``prefix``; as ``alias`` a second one."""
         arguments = ['--ros-args', '--params-file', str(self.parameters)]
-        arguments += ['-p', f'run.listeners:={LOOP_LISTENERS + 1}']
+        arguments += ['-p', f'run.listeners:={self.listeners}']
         if alias:
             arguments += ['-r', f'__node:={alias}']
-        command = [*prefix, executable(PACKAGES[name], name), *arguments]
+        command = [*prefix, executable(self.packages[name], name), *arguments]
         self.nodes[alias or name] = self.group.start(alias or name, command, environment)
 
     def start_all(self, environment: Mapping[str, str] | None = None) -> None:
         """Start every node and return when the loop runs in real time."""
-        for name in PACKAGES:
+        for name in self.packages:
             self.start(name, environment)
         self.wait_for(self.runs, 'the loop to run')
 

@@ -6,6 +6,7 @@ which begins a run. Only the thread of the card touches it; callbacks ask it for
 """
 
 import dataclasses
+import functools
 import sys
 import time
 from collections.abc import Callable
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleNodeMixin
 from std_srvs.srv import Trigger
@@ -25,11 +26,13 @@ from fam_bundle_io.hardware.monitor import Monitor, Sample
 from fam_bundle_io.hardware.safety import Refused, State
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_msgs.msg import BackendInfo, BridgeState, BundleState, ValveCommand
+from fam_bundle_msgs.srv import InjectFault
 from fam_bundle_node.answers import Answers
-from fam_bundle_node.loop_node import LoopNode
+from fam_bundle_node.loop_node import LoopNode, RCLError
 from fam_bundle_node.qos import LATCHED
 from fam_bundle_node.run import run_node
 from fam_bundle_node.steady_timer import SteadyTimer
+from fam_bundle_node.ticks import TickError
 
 GROUPS = (
     'fam',
@@ -47,6 +50,7 @@ SAMPLES = 4096  # whose times are kept for their answers
 START_PERIOD = 0.05  # s between two tries to start by itself
 REPORT_PERIOD = 100_000_000  # ns between two reports of a bridge without a run
 ZERO_SLACK = 2.0  # s beyond the time of zeroing
+LAST_REPORT = Duration(seconds=1)
 CONFIGURE_TIMEOUT = 60.0  # s; a simulated rig compiles its laws, a card may load firmware
 
 
@@ -67,16 +71,20 @@ class HardwareBridge(LoopNode, LifecycleNodeMixin):
         self._seen = State.UNCONFIGURED, ''  # state and fault of the newest sample
         self._reported_idle = self._periods = 0
         self._end: tuple[str, int] | None = None  # why the run is over, and the exit status
+        self._broken = ''  # why the thread of the card has ended
         self._states = self.loop_publisher(BundleState, 'bundle_state')
         self._reports = self.loop_publisher(BridgeState, 'bridge_state')
         self._infos = self.create_publisher(BackendInfo, 'backend_info', LATCHED)
         LifecycleNodeMixin.__init__(self)
-        self.loop_subscription(ValveCommand, 'valve_command', self.on_valve_command)
-        self.create_service(Trigger, '~/arm', self.on_arm)
-        self.create_service(Trigger, '~/disarm', self.on_disarm)
-        self.create_service(Trigger, '~/zero', self.on_zero)
-        self.create_service(Trigger, '~/reset_fault', self.on_reset_fault)
-        self.create_service(Trigger, '~/emergency_stop', self.on_emergency_stop)
+        guarded = self._guarded
+        self.loop_subscription(ValveCommand, 'valve_command', guarded(self.on_valve_command))
+        self.create_service(Trigger, '~/arm', guarded(self.on_arm))
+        self.create_service(Trigger, '~/disarm', guarded(self.on_disarm))
+        self.create_service(Trigger, '~/zero', guarded(self.on_zero))
+        self.create_service(Trigger, '~/reset_fault', guarded(self.on_reset_fault))
+        self.create_service(Trigger, '~/emergency_stop', guarded(self.on_emergency_stop))
+        if hasattr(self.backend, 'inject'):
+            self.create_service(InjectFault, '~/inject_fault', guarded(self.on_inject_fault))
         self.thread.start()
         self._starter = SteadyTimer(self, START_PERIOD, self.start, self.fail_on)
         self._started_at = time.monotonic()
@@ -96,9 +104,8 @@ class HardwareBridge(LoopNode, LifecycleNodeMixin):
             )
         clock = time.monotonic_ns if self.realtime else None
         nominal = configuration.source.nominal_pressure
-        self.monitor = Monitor(
-            load_backend(bridge.backend), setup, hardware.limits, nominal, clock=clock
-        )
+        self.backend: Any = load_backend(bridge.backend)
+        self.monitor = Monitor(self.backend, setup, hardware.limits, nominal, clock=clock)
         return CardThread(
             self.monitor,
             Hooks(self.publish_state, self.publish_idle, self.run_ended, self.card_failed),
@@ -169,7 +176,7 @@ class HardwareBridge(LoopNode, LifecycleNodeMixin):
     def _publish(self, publisher: Any, message: Any) -> None:
         try:
             publisher.publish(message)
-        except rclpy_implementation.RCLError:
+        except RCLError:
             if self.context.ok():  # else a signal has ended the context meanwhile
                 raise
 
@@ -181,10 +188,34 @@ class HardwareBridge(LoopNode, LifecycleNodeMixin):
             self._end = '', 0
 
     def card_failed(self, error: BaseException) -> None:
-        """Note an error that nobody expected; the thread closes the card."""
-        self._end = f'{type(error).__name__}: {error}', 1
+        """Latch a fault for an error that nobody expected; the thread closes the card."""
+        self._broken = f'{type(error).__name__}: {error}'
+        self.monitor.emergency_stop(self._broken)
 
     # ---- Callbacks ----
+
+    def _guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
+        """Return ``callback`` so that an error that nobody expected is a fault and is said.
+
+        The executor would end the node for it, and with it the one who tells why.
+        """
+
+        @functools.wraps(callback)
+        def guarded(*arguments: Any) -> Any:
+            try:
+                return callback(*arguments)
+            except (TickError, RCLError):
+                raise  # the loop's own, for those who receive
+            except Exception as error:
+                reason = f'{callback.__name__}: {type(error).__name__}: {error}'
+                self.monitor.emergency_stop(reason)
+                self.get_logger().error(reason)
+                response = arguments[-1]
+                if hasattr(response, 'success'):
+                    response.success, response.message = False, reason
+                return response
+
+        return guarded
 
     def on_valve_command(self, command: ValveCommand) -> None:
         """Hand the command to the thread of the card."""
@@ -224,13 +255,24 @@ class HardwareBridge(LoopNode, LifecycleNodeMixin):
         response.success, response.message = True, 'every motor unit is opened to the tank'
         return response
 
-    def _answer(
-        self, response: Trigger.Response, action: Callable[[], Any], done: str
-    ) -> Trigger.Response:
+    def on_inject_fault(
+        self, request: InjectFault.Request, response: InjectFault.Response
+    ) -> InjectFault.Response:
+        """Break the simulated rig on purpose, or mend it."""
+
+        def inject(_: Monitor) -> None:
+            if request.fault:
+                self.backend.inject(request.fault, *map(int, request.channels))
+            else:
+                self.backend.heal()
+
+        return self._answer(response, lambda: self.thread.ask(inject), '')
+
+    def _answer(self, response: Any, action: Callable[[], Any], done: str) -> Any:
         try:
             action()
             response.success, response.message = True, done
-        except (Refused, ConfigurationError, OSError, RuntimeError) as error:
+        except (ValueError, OSError, RuntimeError) as error:
             response.success, response.message = False, f'{error}'
             self.get_logger().warning(response.message)
         return response
@@ -333,6 +375,7 @@ class HardwareBridge(LoopNode, LifecycleNodeMixin):
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Let go of the card: the node may be configured again."""
+        self.monitor.emergency_stop(f'the transition from {state.label} failed')
         return self._transition('error', self._release)
 
     def _release(self) -> None:
@@ -348,6 +391,8 @@ class HardwareBridge(LoopNode, LifecycleNodeMixin):
             action()
         except Exception as error:
             self.get_logger().error(f'{name}: {error}')
+            if name != 'configure':  # which leaves the card closed
+                self.monitor.emergency_stop(f'{name}: {error}')
             return TransitionCallbackReturn.FAILURE
         if name == 'configure':
             self.publish_info()
@@ -395,7 +440,12 @@ class HardwareBridge(LoopNode, LifecycleNodeMixin):
     def look_after(self) -> None:
         """End the node after a run that it was to begin by itself."""
         super().look_after()
-        if self._end is None or self.done.done():
+        if self.done.done():
+            return
+        if self._broken:
+            self.report()
+            self.fail(self._broken)
+        if self._end is None:
             return
         reason, status = self._end
         self._end = None
@@ -426,10 +476,18 @@ class HardwareBridge(LoopNode, LifecycleNodeMixin):
         """Stop: three commands in a row could not be used."""
         self.monitor.emergency_stop(reason)
 
+    def fail_on(self, error: Exception) -> None:
+        """Latch a fault, then end the node after an error that nobody expected."""
+        self.monitor.emergency_stop(f'{type(error).__name__}: {error}')
+        super().fail_on(error)
+
     def close(self) -> None:
         """Put the safe volts out and let go of the card, whatever came before."""
         if not self.thread.stop():
             self.get_logger().fatal('the card does not answer: its watchdog is what is left')
+        elif self.context.ok():
+            self._publish(self._reports, self._report_of(self.monitor.sample, 0))
+            self._reports.wait_for_all_acked(LAST_REPORT)
         super().close()
         self._starter.cancel()
 

@@ -25,7 +25,7 @@ FAULTS = {
     'input_open': 'the wire of an input is broken: it reads 0 V',
     'input_rail': 'an input is shorted to the upper end of its range',
     'input_frozen': 'an input keeps its volts',
-    'input_jumping': 'an input jumps to and fro within its live range',
+    'input_jumping': 'an input is anywhere in its live range, another place each sample',
     'input_glitch': 'one sample of an input is 0 V',
     'inputs_swapped': 'the wires of two inputs are exchanged',
     'output_open': 'the wire of an output is broken: the amplifier sees 0 V',
@@ -50,7 +50,6 @@ OF_INPUTS = (
 )
 SOURCE = {'source_off': 0.0, 'source_high': 1.25}  # over the nominal pressure
 OF_CARD = (*SOURCE, 'read_timeout', 'read_error', 'write_error', 'watchdog')
-JUMP = 0.4  # of its live range, by which a jumping input is off to either side of the middle
 
 
 class Scaling(Protocol):
@@ -225,7 +224,7 @@ class VoltsBackend:
         self._pressures = self.values[CHANNELS:]
         self._current, self._spool = np.zeros(units), np.zeros(units)
         self._holds = self.options.hold
-        self._upward = False
+        self._jumps = np.random.default_rng(configuration.sensors.seed)
         self._frozen_inputs, self._frozen_outputs = self.volts.copy(), np.zeros(units)
         self._substeps = configuration.simulation.substeps
         step = (self.rig, self.state.copy(), self._spool, period, self._substeps)
@@ -300,11 +299,8 @@ class VoltsBackend:
         self._convert(self.volts, setup.input_minimum, setup.input_maximum)
 
     def _jumped(self, channel: int) -> float:
-        self._upward = not self._upward
         sensor = self.setup.calibration.sensors()[channel]
-        low, high = sensor.live_minimum, sensor.live_maximum
-        side = JUMP if self._upward else -JUMP
-        return float(0.5 * (low + high) + side * (high - low))
+        return float(self._jumps.uniform(sensor.live_minimum, sensor.live_maximum))
 
     def _put_out(self, volts: Array) -> None:
         if 'write_error' in self.faults:

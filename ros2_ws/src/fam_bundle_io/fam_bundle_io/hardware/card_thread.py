@@ -25,8 +25,9 @@ class Hooks(NamedTuple):
     """What the thread tells its owner; each is called in the thread.
 
     ``sampled(sample, tick, periods)``: a sample of the run, so many periods after its first one;
-    ``idle(sample)``: one outside of a run; ``ended(reason)``: the run is over, with a reason where
-    it ended early; ``failed(error)``: the thread ends after an error that nobody expected.
+    ``idle(sample)``: one outside of a run, or what stands where none could be read;
+    ``ended(reason)``: the run is over, with a reason where it ended early; ``failed(error)``: the
+    thread ends after an error that nobody expected.
     """
 
     sampled: Callable[[Sample, int, int], None]
@@ -138,6 +139,7 @@ class CardThread:
             while not self._stopped:
                 self._serve()
                 if self._monitor.state is State.UNCONFIGURED:
+                    self._hooks.idle(self._monitor.sample)
                     self._wait(SLICE, lambda: False)
                 elif self.running:
                     self._run_tick()
@@ -224,6 +226,8 @@ class CardThread:
         if sample.valid:
             self._tick += 1
             self._hooks.sampled(sample, self._tick, self._passed)
+        else:
+            self._hooks.idle(sample)
 
     def _time_left(self) -> float:
         """Return how long (s) the answer to the newest sample may still take."""

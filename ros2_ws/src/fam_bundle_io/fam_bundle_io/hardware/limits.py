@@ -63,9 +63,9 @@ class Limits:
         default=500,
     )
     strain_rate: float = positive('1/s', 'faster is a jump, no measurement', default=5.0)
-    force_rate: float = positive('N/s', 'faster is a jump, no measurement', default=1e6)
+    force_rate: float = positive('N/s', 'faster is a jump, no measurement', default=1e5)
     pressure_rate: float = positive('Pa/s', 'faster is a jump, no measurement', default=1.5e8)
-    flow_rate: float = positive('m^3/s^2', 'faster is a jump, no measurement', default=1.0)
+    flow_rate: float = positive('m^3/s^2', 'faster is a jump, no measurement', default=0.15)
     zero_time: float = number(
         's', 'over which zeroing takes the mean', default=1.0, minimum=0.01, maximum=60.0
     )

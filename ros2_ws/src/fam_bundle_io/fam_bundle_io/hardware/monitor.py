@@ -95,6 +95,11 @@ class Monitor:
         return self._safety.fault
 
     @property
+    def sample(self) -> Sample:
+        """What the newest tick gave, with the state of now."""
+        return self._report()
+
+    @property
     def readable(self) -> bool:
         """Whether the newest sample could be read."""
         return self._readable
@@ -177,6 +182,9 @@ class Monitor:
         Raises nothing but what ends the process; what went wrong is in ``fault``.
         """
         self._safety.disarm()
+        if self._stop:
+            self._safety.latch(self._stop)
+            self._stop = ''
         interruption: BaseException | None = None
         try:
             if self.state is not State.UNCONFIGURED:
