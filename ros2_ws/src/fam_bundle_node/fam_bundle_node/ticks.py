@@ -104,8 +104,12 @@ class TickJoin:
         """
         tick: int = message.tick
         if self._is_new_run(topic, tick):
+            begun = self._open.get(0, {})
             self._open.clear()
             self._done = None
+            if tick == 0 and begun and topic not in begun:
+                # Whoever joins late is sent the run before by each publisher in turn.
+                self._open[0] = begun
         if self._strict and self._open and tick not in self._open:
             self._refuse(topic, tick)
         if self._done is not None and tick <= self._done:

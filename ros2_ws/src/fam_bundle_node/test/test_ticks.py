@@ -309,6 +309,15 @@ def test_the_first_topic_leads_back_when_its_ticks_do(strict, counts):
         assert add(join, tick) == [tick]
 
 
+@pytest.mark.parametrize('order', [''.join(o) for o in itertools.permutations(TOPICS)])
+def test_who_joins_late_is_sent_the_run_before_and_takes_the_tick_that_waits(order, counts):
+    """Publisher by publisher: what each has kept of the last run, then tick 0 of this one."""
+    join = TickJoin(TOPICS, counts, strict=False)
+    stream = [(topic, tick) for topic in order for tick in (*range(500, 600), 0)]
+    assert completed(join, stream)[-1] == 0
+    assert add(join, 1, TOPICS) == [1]
+
+
 @both_modes
 @pytest.mark.parametrize('open_topics', ['', 'a', 'bc'])
 def test_tick_0_begins_a_new_run(strict, open_topics, counts):
