@@ -3,10 +3,13 @@
 
 import threading
 import time
+import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from fam_bundle_io.hardware import card_thread
 from fam_bundle_io.hardware.backend import load_backend, make_setup
 from fam_bundle_io.hardware.card_thread import CardThread, Hooks
 from fam_bundle_io.hardware.monitor import Monitor
@@ -203,3 +206,40 @@ def test_without_a_run_the_card_is_only_read(loop):
     assert one.idle >= 3
     assert one.ticks == []
     assert one.is_safe()
+
+
+def test_a_run_leaves_nothing_on_the_heap(loop):
+    """Beyond the messages of its owner, who keeps none here."""
+    first, last = {}, {}
+    folder = str(Path(card_thread.__file__).parent)
+
+    def measured(into):
+        taken = tracemalloc.take_snapshot().filter_traces(
+            [tracemalloc.Filter(True, f'{folder}/*')]
+        )
+        into['size'] = sum(trace.size for trace in taken.traces)
+
+    spool = np.full(2, 0.2)
+
+    def answer(tick):
+        if tick == 500:
+            tracemalloc.start()
+        elif tick == 1000:
+            measured(first)
+        elif tick == 3000:
+            measured(last)
+        return spool
+
+    one = loop(answer=answer)
+    one.ticks = one.states = Forgetful()
+    try:
+        one.run(3001)
+    finally:
+        tracemalloc.stop()
+    assert one.reasons == ['']
+    assert last['size'] - first['size'] < 1024, 'bytes in 2000 ticks'
+
+
+class Forgetful(list):
+    def append(self, item):
+        pass
