@@ -301,3 +301,7 @@ def main() -> None:
         sys.exit(130)
     finally:
         os.close(log)
+
+
+if __name__ == '__main__':
+    main()
