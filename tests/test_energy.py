@@ -18,8 +18,8 @@ from fam_bundle_model.parameters import GRAVITY, Configuration, load_configurati
 Found = tuple[Configuration, Trace, Energy, Window]
 
 
-def settled(**reference: Any) -> Found:
-    changes = {'reference': {'cycles': 2, **reference}}
+def settled(fam: dict[str, Any] | None = None, **reference: Any) -> Found:
+    changes = {'reference': {'cycles': 2, **reference}, 'fam': fam or {}}
     configuration = load_configuration(default_configuration(), changes)
     trace = run_offline(configuration)
     cycle = whole_cycles(trace, configuration)[-1]
@@ -33,13 +33,33 @@ def found(request: pytest.FixtureRequest) -> Found:
 
 
 def test_what_goes_in_comes_out(found: Found) -> None:
-    """Over a settled cycle nothing is stored: input is net work and losses.
+    """What the balance leaves is what the force law of slack muscles makes or takes.
 
-    In the compressive regions force and volume are not of one energy function (docs/model.md), so
-    the balance need not close better than that.
+    Over a settled cycle nothing is stored, but in the compressive regions the force law has no
+    energy function: the oil does the work p dV on the muscles, these F dL on the load, and both
+    need not be the same. That difference is computed here from pressures and strain alone.
     """
-    _, _, energies, _ = found
-    assert abs(energies.unexplained) < 0.01 * energies.hydraulic_input
+    configuration, trace, energies, cycle = found
+    inside = ticks_in(trace, cycle)
+    modulus, length = configuration.oil.bulk_modulus, configuration.fam.length[0]
+    given = 0.0
+    for number, unit in enumerate(motor_units(configuration)):
+        pressure = trace['mu_pressure'][inside, number]
+        pairs = zip(pressure, trace['strain'][inside], strict=True)
+        oil = np.array([unit.fams * fam.oil_of(unit.fam, p, e, modulus) for p, e in pairs])
+        given += float(np.sum(0.5 * (pressure[1:] + pressure[:-1]) * np.diff(oil)))
+    force, strain = trace['force'][inside], trace['strain'][inside]
+    done = float(np.sum(0.5 * (force[1:] + force[:-1]) * length * np.diff(strain)))
+    net = energies.output - energies.returned
+    assert net == pytest.approx(done, rel=0.02)
+    assert energies.unexplained == pytest.approx(given - done, abs=0.03 * net)
+
+
+def test_a_unit_that_stays_taut_leaves_nothing_unexplained() -> None:
+    """There the force law has an energy function."""
+    _, _, energies, _ = settled(amplitude=0.03, fam={'count': [2]})
+    net = energies.output - energies.returned
+    assert abs(energies.unexplained) < 0.02 * net
 
 
 def test_the_output_lifts_the_load_against_damping_and_friction(found: Found) -> None:
@@ -51,12 +71,12 @@ def test_the_output_lifts_the_load_against_damping_and_friction(found: Found) ->
     resisting = load.damping * length * speed + load.friction_force * np.tanh(
         speed / load.friction_rate
     )
-    lost = float(np.sum(np.clip(resisting * length * speed, 0.0, None)[speed > 0.0]) * 1e-3)
+    power = resisting * length * speed
+    lost_up, lost_down = (float(power[where].sum() * 1e-3) for where in (speed > 0.0, speed < 0.0))
     lifted = load.mass * GRAVITY * length * (strain.max() - strain.min())
     # Between two shifts the strain dips and is lifted again: at most a few percent more.
-    assert lifted < energies.output < 1.05 * (lifted + lost)
-    given_back = load.mass * GRAVITY * length * (strain.max() - strain.min())
-    assert energies.returned < 1.05 * given_back
+    assert lifted < energies.output < 1.05 * (lifted + lost_up)
+    assert 0.95 * (lifted - lost_down) < energies.returned < 1.05 * lifted
 
 
 def test_the_modelled_flow_is_the_measured_one(found: Found) -> None:
@@ -108,3 +128,27 @@ def test_cycles_are_the_same_from_parameters_and_from_valleys() -> None:
         assert len(whole_cycles(cut, configuration)) == len(whole_cycles(cut)) == 2
         late = {name: values[500:] for name, values in trace.items()}
         assert len(whole_cycles(late, configuration)) == 2
+
+
+def test_a_sample_that_is_not_finite_spoils_its_own_cycle_only() -> None:
+    configuration, trace, energies, cycle = settled(frequency=0.5)
+    trace['strain'][100] = np.nan
+    found = powers(trace, configuration)
+    assert energy(trace, found, cycle) == energies
+    with pytest.raises(ValueError, match='not finite'):
+        energy(trace, found, Window(0.0, 2.0))
+
+
+def test_parts_of_a_cycle_are_no_cycles() -> None:
+    _, trace, _, _ = settled(frequency=0.5)
+
+    def part(start: float, stop: float) -> Trace:
+        inside = ticks_in(trace, Window(start, stop))
+        return {name: values[inside] for name, values in trace.items()}
+
+    assert whole_cycles(part(0.0, 1.2)) == []
+    assert whole_cycles(part(0.5, 1.7)) == []
+    assert whole_cycles(part(1.3, 2.7)) == []
+    assert len(whole_cycles(part(0.0, 2.7))) == 1
+    assert len(whole_cycles(part(1.3, 4.0))) == 1
+    assert len(whole_cycles(part(0.0, 2.0))) == 1

@@ -2,6 +2,7 @@
 """The commands that work on bags: ``./fam report``, ``./fam replay`` and ``./fam recover``."""
 
 import argparse
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from fam_bundle_bringup.progress import progress_bar
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_model.parameters import Configuration, load_configuration
+from fam_bundle_model.schema import ConfigurationError
 
 NAMES = ('report', 'replay', 'recover')
 PACKAGES = ('mcap', 'rosbags', 'zstandard', 'pandas', 'plotly')  # that only bags need
@@ -76,10 +78,20 @@ def run_bag_command(options: argparse.Namespace) -> int:
         return 2
 
 
+def check_folder(folder: Path) -> None:
+    """Raise ConfigurationError unless ``folder`` can be written to; make nothing yet."""
+    there = folder
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir() or not os.access(there, os.W_OK):
+        raise ConfigurationError(f'--out {folder}: cannot be written')
+
+
 def run_report(options: argparse.Namespace) -> int:
     """Write a report and say where; status 1 when a bag could not be used."""
     from fam_bundle_io.report_files import steps_of, write_report
 
+    check_folder(options.out)
     given: Configuration | None = None
     if options.config is not None:
         given = load_configuration(options.config)

@@ -46,8 +46,9 @@ class Energy(NamedTuple):
 
     ``output`` is done on the load while the bundle contracts, ``returned`` is what the load gives
     back while it lengthens. ``efficiency`` is ``output / hydraulic_input``. ``unexplained`` is
-    what the input leaves after work and losses: change of stored energy, and the errors of
-    sensors and model. ``modelled_oil`` is the modelled flow into all units over the measured one.
+    what the input leaves after work and losses: change of stored energy, errors of sensors and
+    model, and what the force law of slack FAMs makes or takes, which has no energy function
+    (docs/model.md). ``modelled_oil`` is the modelled flow into all units over the measured one.
     """
 
     hydraulic_input: float
@@ -106,14 +107,25 @@ def powers(
 def _contracting(strain: Array, step: float) -> npt.NDArray[np.bool_]:
     from scipy.ndimage import uniform_filter1d
 
-    smooth = uniform_filter1d(strain, max(round(SMOOTHING / step), 1))
+    known = np.flatnonzero(np.isfinite(strain))
+    if not known.size:
+        return np.zeros(len(strain), dtype=np.bool_)
+    # A running mean would hand one gap on to all that follows.
+    filled = np.interp(np.arange(len(strain)), known, strain[known])
+    smooth = uniform_filter1d(filled, max(round(SMOOTHING / step), 1))
     return np.asarray(np.gradient(smooth) > 0.0, dtype=np.bool_)
 
 
 def energy(trace: Trace, found: Powers, window: Window) -> Energy:
-    """Return what the powers ``found`` in ``trace`` come to within ``window``."""
+    """Return what the powers ``found`` in ``trace`` come to within ``window``.
+
+    Raises ValueError where something in it is not finite.
+    """
     inside = ticks_in(trace, window)
     step = steps(trace)[inside]
+    for power in (found.source, found.load, found.supply_loss, found.return_loss):
+        if not np.isfinite(power[inside]).all():
+            raise ValueError('a power is not finite')
 
     def total(power: Array) -> float:
         return float((power[inside] * step).sum())

@@ -16,6 +16,7 @@ from fam_bundle_io.figures_style import (
 from fam_bundle_io.timing import Timing
 
 MICROSECONDS = 1e6  # per s
+SHORTEST = 1.0  # us that the logarithmic axis shows
 
 
 @styled
@@ -62,17 +63,18 @@ def energy_figure(energies: Mapping[str, Mapping[str, Any]]) -> Figure:
 
 @styled
 def timing_figure(timings: Mapping[str, Timing]) -> Figure:
-    """Return the share of ticks answered within a time (microseconds), a panel for each run."""
+    """Return the share of samples answered within a time (microseconds), a panel for each run."""
     figure = Figure(figsize=(7.2, 0.5 + 2.1 * len(timings)))
     panels = figure.subplots(len(timings), 1, squeeze=False, sharex=True)[:, 0]
     for axes, (name, times) in zip(panels, timings.items(), strict=True):
         curves = {**times.answers, 'next sample': times.interval}
         for position, (topic, values) in enumerate(curves.items()):
-            ordered = MICROSECONDS * np.sort(values[values > 0.0])
-            share = np.arange(1, len(ordered) + 1) / max(len(ordered), 1)
+            ordered = np.sort(np.maximum(MICROSECONDS * values, SHORTEST))
+            # Of all samples: what was never answered keeps the curve below 1.
+            share = np.arange(1, len(ordered) + 1) / times.samples
             axes.plot(ordered, share, label=topic, **scheme_style(position))
         axes.set_xscale('log')
-        axes.set_ylabel('share of ticks')
+        axes.set_ylabel('share of samples')
         axes.set_title(name, loc='left')
         legend_beside(axes)
     panels[-1].set_xlabel('time from a sample (µs)')

@@ -46,14 +46,14 @@ def _shifts_within(trace: Trace, window: slice) -> tuple[list[float], list[float
 
 
 @styled
-def run_figure(trace: Trace, title: str) -> Figure:
-    """Return the last cycle of a run of any scheme (Figures 11, 12 and 13).
+def run_figure(trace: Trace, title: str, window: slice | None = None) -> Figure:
+    """Return the last cycle of a run of any scheme (Figures 11, 12 and 13), or ticks ``window``.
 
     Panels: strain (%); times to saturation and desaturation beside the recruitment lag (s),
     where the trace holds any; recruitment state; pressures (kPa); strain error (%). A vertical
     dashed line marks each shift.
     """
-    window = last_cycle(trace)
+    window = last_cycle(trace) if window is None else window
     predicted = any(
         np.isfinite(trace[name][window].astype(float)).any()
         for name in ('time_to_saturation', 'time_to_desaturation')
@@ -136,24 +136,31 @@ def _draw_pressures(axes: Axes, trace: Trace, window: slice) -> None:
 
 
 @styled
-def comparison_figure(traces: Mapping[str, Trace]) -> Figure:
+def comparison_figure(
+    traces: Mapping[str, Trace], windows: Mapping[str, slice] | None = None
+) -> Figure:
     """Return how the schemes in ``traces`` (by their names) track the last cycle (Figure 14).
 
+    ``windows`` are the ticks of the cycles, where they are known.
     Panels: reference and strain (%) around the first upshifts, a triangle at each; strain errors
     (%) over the whole cycle. Times in s from the start of the cycle.
     """
     figure = Figure(figsize=(7.2, 5.6))
     near, whole = figure.subplots(2, 1, gridspec_kw={'height_ratios': [3.0, 2.0]})
     firsts: list[float] = []
+    references: list[Array] = []
     shown: list[tuple[Array, Array]] = []
     for position, (name, trace) in enumerate(traces.items()):
-        window, style = last_cycle(trace), scheme_style(position)
+        window = windows[name] if windows else last_cycle(trace)
+        style = scheme_style(position)
         time = signal(trace, 'time')[window]
         start = time[0]
         strain = PERCENT * signal(trace, 'strain')[window]
         reference = PERCENT * signal(trace, 'strain_reference')[window]
-        if position == 0:
-            near.plot(time - start, reference, label='reference', **REFERENCE)
+        if not any(same_curve(reference, known) for known in references):
+            label = f'reference of {name}' if references else 'reference'
+            near.plot(time - start, reference, label=label, **REFERENCE)
+            references.append(reference)
         near.plot(time - start, strain, label=name, **style)
         whole.plot(time - start, reference - strain, **style)
         shown += [(time - start, strain), (time - start, reference)]
@@ -179,6 +186,18 @@ def comparison_figure(traces: Mapping[str, Trace]) -> Figure:
     whole.set_ylabel('error (% strain)')
     whole.set_xlabel('time from the start of the cycle (s)')
     return figure
+
+
+def same_curve(one: Array, other: Array) -> bool:
+    """Return whether two references over a cycle are the same but for skipped ticks."""
+    points = np.linspace(0.0, 1.0, 200)
+
+    def sampled(values: Array) -> Array:
+        return np.interp(points, np.linspace(0.0, 1.0, len(values)), values)
+
+    alike = abs(len(one) - len(other)) <= 0.1 * max(len(one), len(other))
+    span = float(np.ptp(one))
+    return alike and bool(np.allclose(sampled(one), sampled(other), atol=0.05 * span))
 
 
 def _zoom(axes: Axes, curves: list[tuple[Array, Array]], start: float, stop: float) -> None:

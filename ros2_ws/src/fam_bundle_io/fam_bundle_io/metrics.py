@@ -11,6 +11,7 @@ from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration
 
 SATURATED = 0.97  # share of the source pressure from which a unit counts as saturated
+AT_LEAST = 1e-3  # share of the reference's range within which it is at its least
 SLACK = 1e-9  # s by which rounding may move the edge of a window
 
 
@@ -58,9 +59,13 @@ def steps(trace: Trace) -> npt.NDArray[np.float64]:
 
 
 def shift_times(trace: Trace) -> tuple[list[float], list[float]]:
-    """Return the times in s of the upshifts and of the downshifts."""
-    change = np.diff(trace['recruitment_state'].astype(int), prepend=1)
-    time = trace['time']
+    """Return the times in s of the upshifts and of the downshifts.
+
+    A run begins with one unit; where the trace begins later, nothing is known of what was before.
+    """
+    state, time = trace['recruitment_state'].astype(int), trace['time']
+    before = 1 if time.size and time[0] == 0.0 else state[:1]
+    change = np.diff(state, prepend=before)
     return time[change > 0].tolist(), time[change < 0].tolist()
 
 
@@ -87,13 +92,27 @@ def whole_cycles(trace: Trace, configuration: Configuration | None = None) -> li
         ]
     else:
         edges = [*time.tolist(), float(time[-1]) + step]
-        marks = valleys(trace['strain_reference'])
+        reference = trace['strain_reference']
+        marks = [m for m in valleys(reference) if _is_valley(trace, m)]
         cycles = [Window(edges[a], edges[b]) for a, b in pairwise(marks)]
-        longest = max(cycle.stop - cycle.start for cycle in cycles)
-        cycles = [cycle for cycle in cycles if cycle.stop - cycle.start > 0.99 * longest]
     # In real time the first or last period of a cycle may be skipped.
     slack = 1.5 * step
     return [c for c in cycles if c.start > time[0] - slack and c.stop < time[-1] + step + slack]
+
+
+def _is_valley(trace: Trace, tick: int) -> bool:
+    """Return whether the reference has a valley at ``tick``, one of ``valleys``.
+
+    Those inside the run are valleys; its ends are, where the reference is at its least there: a
+    run that begins later than at 0 s, or is cut short, begins or ends within a cycle.
+    """
+    time, reference = trace['time'], trace['strain_reference']
+    if 0 < tick < len(time):
+        return True
+    if tick == 0 and time[0] > SLACK:
+        return False
+    least, largest = float(reference.min()), float(reference.max())
+    return bool(reference[min(tick, len(time) - 1)] < least + AT_LEAST * (largest - least))
 
 
 # ---- States and saturation ----

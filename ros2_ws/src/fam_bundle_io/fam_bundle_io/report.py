@@ -7,12 +7,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
 from fam_bundle_io.bag import (
+    LOOP,
+    STATE,
     Bag,
     Run,
     loop_topics,
     read_bag,
     recorded_configuration,
+    runs_of,
     trace_of,
 )
 from fam_bundle_io.bag_writer import BagError
@@ -26,14 +32,16 @@ from fam_bundle_io.metrics import (
     tracking,
     whole_cycles,
 )
-from fam_bundle_io.timing import Timing, applied_spool, phases, spread, timing
+from fam_bundle_io.timing import Timing, applied_spool, spread, timing
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration
 from fam_bundle_model.schema import ConfigurationError
 
+LONGEST_GAP = 1.0  # s between two ticks
 OIL_MISMATCH = 0.02  # between modelled and measured flow, beyond which losses are doubtful
 # What the energies are computed from.
 ENERGETIC = {'strain', 'force', 'source_pressure', 'source_flow', 'mu_pressure', 'spool'}
+FINITE = ENERGETIC | {'strain_reference', 'pressure_reference'}  # predicted times may be infinite
 
 
 class ReportedRun(NamedTuple):
@@ -53,15 +61,18 @@ def reported_runs(
 ) -> tuple[list[ReportedRun], list[str]]:
     """Return the last run of every bundle in the bag at ``path``, and what is wrong with it.
 
-    ``given`` stands in for the configuration where the bag holds none. Raises BagError when
-    nothing can be read.
+    ``given`` takes the place of the configuration in the bag. Raises BagError when nothing can be
+    read.
     """
     bag = read_bag(path)
-    warnings, configuration = list(bag.warnings), given
+    warnings, recorded = list(bag.warnings), None
     try:
-        configuration = recorded_configuration(bag) or given
+        recorded = recorded_configuration(bag)
     except ConfigurationError as error:
         warnings.append(f'{error}: not used')
+    if given is not None and recorded is not None and given != recorded:
+        warnings.append('the parameters are those of --config, not those in the bag')
+    configuration = given or recorded
     if configuration is None:
         warnings.append(
             "no parameters in the bag: cycles are taken from the reference's valleys, and there "
@@ -92,12 +103,20 @@ def names_of(paths: Sequence[Path]) -> list[str]:
     parts = [path.resolve().parts for path in paths]
     # An experiment's bag is DIR/bag: its folder tells more.
     parts = [p[:-1] if p[-1] == 'bag' and len(p) > 2 else p for p in parts]
-    for length in range(1, max(map(len, parts))):
-        names = ['/'.join(p[-length:]) for p in parts]
+    for length in range(1, max(map(len, parts)) + 1):
+        names = ['/'.join(p[-length:]).encode(errors='replace').decode() for p in parts]
         if len(set(names)) == len(names):
             return names
     twice = next(path for path in paths if parts.count(parts[paths.index(path)]) > 1)
     raise BagError(f'{twice}: named twice')
+
+
+def last_cycle_of(run: ReportedRun) -> Window | None:
+    """Return the cycle that the metrics of a run are over, if there is one."""
+    if not run.numbers['cycles']:
+        return None
+    last = run.numbers['cycles'][-1]
+    return Window(last['metrics_from'], last['metrics_to'])
 
 
 def _reported(
@@ -112,6 +131,11 @@ def _reported(
             f'{trace["spool"].shape[1]}: not used'
         )
         configuration = None
+    warnings += _checked_times(trace['time'], namespace)
+    warnings += _gaps(trace, run.missing)
+    runs = int(runs_of(bag.tables[f'{namespace}/{LOOP[STATE]}']).max()) + 1
+    if runs > 1:
+        warnings.append(f'{runs} runs in the bag: this is the last')
     time, step = trace['time'], steps(trace)
     whole = Window(float(time[0]), float(time[-1] + step[-1]))
     told = configuration is not None or 'strain_reference' not in run.missing
@@ -123,15 +147,21 @@ def _reported(
         found = powers(trace, configuration, applied_spool(bag, run, namespace))
     elif lacking:
         warnings.append(f'no energies without {", ".join(lacking)}')
-    if found is not None:
-        warnings += _doubts(energy(trace, found, whole).modelled_oil)
     times = timing(bag, run, namespace)
-    safe = {'time': float((step * times.safe).sum()), 'phases': len(phases(times.safe))}
-    if safe['phases']:
-        warnings.append(
-            f'the plant was safe, open to the tank, for {safe["time"]:.3f} s in '
-            f'{plural(safe["phases"], "phase")}'
-        )
+    warnings += times.doubts
+    safe = None
+    if times.safe is None:
+        warnings.append('the bag does not tell when the plant was safe')
+    else:
+        duration = sum(phase.stop - phase.start for phase in times.safe)
+        safe = {'time': duration, 'phases': len(times.safe)}
+        if times.safe:
+            warnings.append(
+                f'the plant was safe, open to the tank, for {duration:.3f} s in '
+                f'{plural(len(times.safe), "phase")}'
+            )
+    whole_numbers = _window_numbers(trace, run.missing, found, whole)
+    warnings += _doubts(whole_numbers['energy'])
     numbers = {
         'namespace': namespace,
         'warnings': warnings,
@@ -143,7 +173,7 @@ def _reported(
         'stop': whole.stop,
         'safe': safe,
         **_window_numbers(trace, run.missing, found, cycles[-1] if cycles else None),
-        'whole_run': _window_numbers(trace, run.missing, found, whole),
+        'whole_run': whole_numbers,
         'cycles': [_window_numbers(trace, run.missing, found, cycle) for cycle in cycles],
         'timing': _timing_numbers(times),
     }
@@ -168,9 +198,37 @@ def _shortness(
     return words
 
 
-def _doubts(modelled_oil: float) -> list[str]:
-    off = modelled_oil - 1.0
-    if abs(off) <= OIL_MISMATCH:
+def _checked_times(time: npt.NDArray[np.float64], namespace: str) -> list[str]:
+    """Return what is odd about the times of the ticks; raises BagError where they are none."""
+    name = f'{namespace}/{LOOP[STATE]}'
+    if len(time) < 2:
+        raise BagError(f'{name}: one tick is no run')
+    gap = np.diff(time)
+    if not np.all(gap > 0.0):
+        at = int(np.argmin(gap > 0.0))
+        raise BagError(f'{name}: its stamps do not rise after {time[at]:g} s')
+    at = int(np.argmax(gap))
+    if gap[at] <= LONGEST_GAP:
+        return []
+    return [f'nothing for {gap[at]:g} s after {time[at]:g} s: what is summed over it is doubtful']
+
+
+def _gaps(trace: Trace, missing: frozenset[str]) -> list[str]:
+    """Return which measured signals are not finite, and how often."""
+    words = []
+    for name in sorted(FINITE - missing):
+        values = trace[name].reshape(len(trace['time']), -1)
+        count = int(np.count_nonzero(~np.isfinite(values).all(axis=1)))
+        if count:
+            words.append(
+                f'{name}: not finite at {plural(count, "tick")}: no metrics of such a cycle'
+            )
+    return words
+
+
+def _doubts(energies: dict[str, Any] | None) -> list[str]:
+    off = energies['modelled_oil'] - 1.0 if energies else 0.0
+    if not abs(off) > OIL_MISMATCH:
         return []
     return [
         f'the modelled flow of the units is {abs(off):.1%} {"above" if off > 0.0 else "below"} '
@@ -200,7 +258,9 @@ def _window_numbers(
     numbers |= {'metrics_from': window.start, 'metrics_to': window.stop}
     if not {'strain', 'strain_reference'} & missing:
         with contextlib.suppress(ValueError):  # fewer than two ticks
-            numbers |= tracking(trace, *window)._asdict()
+            found_tracking = tracking(trace, *window)
+            if np.isfinite(found_tracking).all():
+                numbers |= found_tracking._asdict()
     if 'recruitment_state' not in missing:
         up, down = shift_times(trace)
         numbers['upshift_times'] = [t for t in up if window.start <= t < window.stop]
@@ -209,7 +269,8 @@ def _window_numbers(
         numbers['time_in_state'] = {str(state): time for state, time in states.items()}
     numbers['time_at_source'] = time_at_source(trace, window)
     if found is not None:
-        numbers['energy'] = energy(trace, found, window)._asdict()
+        with contextlib.suppress(ValueError):  # not finite
+            numbers['energy'] = energy(trace, found, window)._asdict()
     return numbers
 
 

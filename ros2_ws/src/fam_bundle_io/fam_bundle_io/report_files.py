@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fam_bundle_io.bag_writer import BagError
-from fam_bundle_io.report import ReportedRun, names_of, reported_runs, without_nan
+from fam_bundle_io.metrics import ticks_in
+from fam_bundle_io.report import (
+    ReportedRun,
+    last_cycle_of,
+    names_of,
+    reported_runs,
+    without_nan,
+)
 from fam_bundle_io.report_page import report_page
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.files import whole_file
@@ -33,7 +40,7 @@ def write_report(
 ) -> tuple[list[ReportedRun], list[str]]:
     """Write the report on the last run of every bundle in ``bags`` to ``folder``.
 
-    ``configuration`` stands in for the one that a bag does not hold. Returns the runs and what is
+    ``configuration`` takes the place of those in the bags. Returns the runs and what is
     wrong with bags that cannot be read or hold no run. Raises BagError when no bag holds one;
     nothing is written then.
     """
@@ -52,6 +59,7 @@ def write_report(
     page, drawn = report_page(runs, troubles), draw_figures(runs)
     progress(len(bags) + 1)
     folder.mkdir(parents=True, exist_ok=True)
+    remove_earlier(folder)
     _write(folder / 'report.html', page)
     content = {'runs': {run.name: run.numbers for run in runs}, 'unreadable': troubles}
     _write(folder / 'report.json', json.dumps(without_nan(content), indent=1, allow_nan=False))
@@ -59,7 +67,7 @@ def write_report(
     progress(len(bags) + 2)
     _write(folder / 'cycles.csv', cycle_table(runs).to_csv(index=False))
     for run in runs:
-        _write(folder / f'{file_name(run)}.csv', tick_table(run.trace).to_csv(index=False))
+        _write(folder / f'{file_name(run.name)}.csv', tick_table(run.trace).to_csv(index=False))
     progress(steps_of(bags))
     return runs, troubles
 
@@ -75,24 +83,54 @@ def _save(drawn: 'dict[str, Figure]', folder: Path) -> None:
     save_figures(drawn, folder)
 
 
-def file_name(run: ReportedRun) -> str:
-    """Return how the files of a run are called."""
-    return run.name.replace('/', '_')
+def file_name(name: str) -> str:
+    """Return how the files of the run ``name`` are called."""
+    return f'run_{name.replace("/", "_")}'
+
+
+def remove_earlier(folder: Path) -> None:
+    """Remove the report that is in ``folder``: no figure of it may stand beside a new one."""
+    try:
+        names = list(json.loads((folder / 'report.json').read_text())['runs'])
+    except (OSError, ValueError, TypeError, KeyError):
+        names = []
+    figures = ('comparison', 'energy', 'timing', *map(file_name, names))
+    files = [f'{name}.{suffix}' for name in figures for suffix in ('png', 'pdf')]
+    files += [f'{file_name(name)}.csv' for name in names]
+    for name in ('report.html', 'report.json', 'cycles.csv', *files):
+        (folder / name).unlink(missing_ok=True)
 
 
 def draw_figures(runs: Sequence[ReportedRun]) -> 'dict[str, Figure]':
     """Return each run as in Figures 11 to 13, all as in Figure 14, energy and timing, by name."""
     from fam_bundle_io import figures
 
-    drawn = {file_name(run): figures.run_figure(run.trace, title_of(run)) for run in runs}
-    tracked = {run.name: run.trace for run in runs if run.numbers['cycles']}
+    windows = {run.name: ticks_of(run) for run in runs}
+    drawn = {
+        file_name(run.name): figures.run_figure(run.trace, title_of(run), windows[run.name])
+        for run in runs
+    }
+    tracked = {
+        run.name: run.trace
+        for run in runs
+        if run.numbers['cycles'] and 'strain_reference' not in run.missing
+    }
     if tracked:
-        drawn['comparison'] = figures.comparison_figure(tracked)
+        drawn['comparison'] = figures.comparison_figure(tracked, windows)
     energies = {run.name: run.numbers['energy'] for run in runs if run.numbers['energy']}
     if energies:
         drawn['energy'] = figures.energy_figure(energies)
     drawn['timing'] = figures.timing_figure({run.name: run.timing for run in runs})
     return drawn
+
+
+def ticks_of(run: ReportedRun) -> slice:
+    """Return the ticks of the cycle that the metrics are over, all where there is none."""
+    cycle = last_cycle_of(run)
+    if cycle is None:
+        return slice(0, len(run.trace['time']))
+    inside = np.flatnonzero(ticks_in(run.trace, cycle))
+    return slice(int(inside[0]), int(inside[-1]) + 1)
 
 
 def title_of(run: ReportedRun) -> str:

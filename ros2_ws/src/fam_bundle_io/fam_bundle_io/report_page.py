@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from fam_bundle_io.figures_runs import same_curve
 from fam_bundle_io.figures_style import (
     DOWNSHIFT,
     KILOPASCAL,
@@ -17,14 +18,14 @@ from fam_bundle_io.figures_style import (
     UNIT_COLOURS,
     UPSHIFT,
 )
-from fam_bundle_io.metrics import Window, ticks_in
-from fam_bundle_io.report import ReportedRun, plural
-from fam_bundle_io.timing import phases
+from fam_bundle_io.metrics import ticks_in
+from fam_bundle_io.report import ReportedRun, last_cycle_of, plural
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 MOST_PHASES = 200  # in which the plant was safe, that are marked
+DASHES = ('dash', 'dot', 'dashdot', 'longdash')  # of different references
 POINTS = 50_000  # of a curve; longer ones are drawn by their extremes
 BINS = 80  # of a histogram
 MICROSECONDS = 1e6  # per s
@@ -155,7 +156,7 @@ def _run_section(run: ReportedRun, number: int) -> list[str]:
     if n['parameters_hash']:
         said += f', parameters {n["parameters_hash"][:12]}'
     thinned = '' if n['ticks'] <= POINTS else f' Curves are drawn by {POINTS} extremes.'
-    marked = ' Shaded: the plant was safe.' if n['safe']['phases'] else ''
+    marked = ' Shaded: the plant was safe.' if run.timing.safe else ''
     return [
         f'<h2 id="run{number}">{html.escape(run.name)}</h2>',
         f'<p class="note">{html.escape(said)}. Drag in a panel to zoom all of them, double-click '
@@ -315,22 +316,21 @@ def run_panels(run: ReportedRun) -> 'Figure':
     figure.update_yaxes(range=[-2.0 * longest, 4.0 * longest], row=2, col=1)
     figure.update_yaxes(dtick=1, range=[0.7, len(units) + 0.3], row=3, col=1)
     figure.update_xaxes(title_text='time (s)', row=len(titles), col=1)
-    ends = [*time[1:], time[-1]]
     # All at once, over the height of all panels: one by one takes plotly minutes.
     shapes = [
         {
             'type': 'rect',
             'xref': 'x',
             'yref': 'paper',
-            'x0': time[first],
-            'x1': ends[last],
+            'x0': phase.start,
+            'x1': phase.stop,
             'y0': 0.0,
             'y1': 1.0,
             'fillcolor': '#CC79A7',
             'opacity': 0.3,
             'line': {'width': 0},
         }
-        for first, last in phases(run.timing.safe)[:MOST_PHASES]
+        for phase in (run.timing.safe or [])[:MOST_PHASES]
     ]
     figure.update_layout(shapes=shapes)
     return figure
@@ -339,30 +339,25 @@ def run_panels(run: ReportedRun) -> 'Figure':
 def comparison(runs: Sequence[ReportedRun]) -> 'Figure':
     """Return how the runs track the last cycle, over the time from its start (Figure 14)."""
     figure = _panels(['strain (%)', 'error (%)'], (4.0, 3.0))
-    referenced = False
+    references: list[npt.NDArray[np.float64]] = []
     for position, run in enumerate(runs):
-        cycle = _last_cycle(run)
-        if cycle is None:
+        cycle = last_cycle_of(run)
+        if cycle is None or 'strain_reference' in run.missing:
             continue
         inside = ticks_in(run.trace, cycle)
         time = run.trace['time'][inside] - cycle.start
         strain = PERCENT * run.trace['strain'][inside]
         reference = PERCENT * run.trace['strain_reference'][inside]
         colour = SCHEME_COLOURS[position % len(SCHEME_COLOURS)]
-        if not referenced:
-            _curve(figure, 1, time, reference, 'reference', color='#000000', dash='dash')
-            referenced = True
+        if not any(same_curve(reference, known) for known in references):
+            name = f'reference of {run.name}' if references else 'reference'
+            dash = DASHES[len(references) % len(DASHES)]
+            _curve(figure, 1, time, reference, name, color='#000000', dash=dash)
+            references.append(reference)
         _curve(figure, 1, time, strain, run.name, color=colour)
         _curve(figure, 2, time, reference - strain, f'{run.name}: error', color=colour)
     figure.update_xaxes(title_text='time from the start of the cycle (s)', row=2, col=1)
     return figure
-
-
-def _last_cycle(run: ReportedRun) -> Window | None:
-    if not run.numbers['cycles']:
-        return None
-    last = run.numbers['cycles'][-1]
-    return Window(last['metrics_from'], last['metrics_to'])
 
 
 def _energy_section(runs: Sequence[ReportedRun]) -> str:
@@ -429,7 +424,9 @@ def _energy_section(runs: Sequence[ReportedRun]) -> str:
     note = (
         '<p class="note">Input, output and what the load gives back are measured. The losses in '
         'valves and hoses are modelled, for the flow of each unit is not measured; the last '
-        'column says how well the modelled flow of all units agrees with the measured one.</p>'
+        'column says how well the modelled flow of all units agrees with the measured one. '
+        'Unexplained is the rest, also what the force law of slack muscles makes or takes: it has '
+        'no energy function there.</p>'
     )
     return _drawn(figure) + table(headings, rows) + note
 

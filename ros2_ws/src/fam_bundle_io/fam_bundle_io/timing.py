@@ -5,12 +5,14 @@ From the publishers' times in the bag. All nodes must have run on one machine, o
 clocks agree; a bag without publishers' times (SQLite) gives the recorder's instead.
 """
 
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from fam_bundle_io.bag import LOOP, STATE, Bag, Run, run_tables
+from fam_bundle_io.metrics import Window
 from fam_bundle_model.hydraulics import TO_TANK
 
 if TYPE_CHECKING:
@@ -44,15 +46,17 @@ class Timing(NamedTuple):
 
     ``interval`` (n - 1,) is the time in s between two samples, ``answers`` by topic the time in s
     from a sample to what answers it, ``answered`` by topic how many of the ``samples`` have an
-    answer in the bag. ``safe`` (ticks,) tells at which ticks of the trace the plant did not
-    follow commands. ``nodes`` are the last reports of the nodes.
+    answer in the bag. ``safe`` are the stretches of the run in which the plant did not follow
+    commands, None where the bag does not tell. ``doubts`` say why the times are no such times;
+    ``nodes`` are the last reports of the nodes.
     """
 
     samples: int
     interval: Array
     answers: dict[str, Array]
     answered: dict[str, int]
-    safe: Flags
+    safe: list[Window] | None
+    doubts: list[str]
     nodes: list[dict[str, Any]]
 
 
@@ -68,10 +72,38 @@ def timing(bag: Bag, found: Run, namespace: str = '', run: int = -1) -> Timing:
             table['published'].loc[both] - samples['published'].loc[both]
         )
     interval = _seconds(samples['published'].diff().iloc[1:])
-    safe = np.zeros(len(found.ticks), bool)
-    if 'safe' in samples:
-        safe = samples['safe'].to_numpy(bool)[samples.index.get_indexer(found.ticks)]
-    return Timing(len(samples), interval, answers, answered, safe, _reports(bag, namespace))
+    return Timing(
+        len(samples),
+        interval,
+        answers,
+        answered,
+        _safe(samples),
+        list(_doubts(samples, tables)),
+        _reports(bag, namespace),
+    )
+
+
+def _safe(samples: 'pd.DataFrame') -> list[Window] | None:
+    """Return when the plant was safe, from all samples: it is when controllers do not answer."""
+    needed = ('safe', 'header.stamp.sec', 'header.stamp.nanosec')
+    if any(name not in samples for name in needed):
+        return None
+    time = samples['header.stamp.sec'].to_numpy(float)
+    time = time + 1e-9 * samples['header.stamp.nanosec'].to_numpy(float)
+    ends = np.append(time[1:], time[-1])
+    found = phases(samples['safe'].to_numpy(bool))
+    return [Window(float(time[first]), float(ends[last])) for first, last in found]
+
+
+def _doubts(samples: 'pd.DataFrame', answers: 'Mapping[str, pd.DataFrame]') -> Iterator[str]:
+    """Yield why the times of publishing do not tell how long anything took."""
+    tables = [samples, *answers.values()]
+    if any((table['published'].diff() < 0).any() for table in tables):
+        yield 'the system clock was set back during the run: times of answers are no such times'
+    if all((table['published'] == table['received']).all() for table in tables):
+        yield (
+            "the bag holds no publishers' times: those of answers are from one receipt to another"
+        )
 
 
 def phases(flags: Flags) -> list[tuple[int, int]]:
@@ -92,10 +124,13 @@ def applied_spool(bag: Bag, found: Run, namespace: str = '', run: int = -1) -> A
     """Return the spool commands that act from each tick of a run to the next (ticks, units).
 
     That is the newest command that was published before the next sample, one of an earlier tick
-    where the answer came late; and open to the tank while the plant was safe.
+    where the answer came late; and open to the tank while the plant was safe. Where times of
+    publishing cannot tell, each command acts from its own tick.
     """
     tables, _ = run_tables(bag, namespace, run)
     samples, commands = tables[STATE], tables[COMMAND]
+    if any((table['published'].diff() < 0).any() for table in (samples, commands)):
+        return np.asarray(found.trace['spool'])
     units = found.trace['spool'].shape[1]
     spool = commands[[f'spool[{unit}]' for unit in range(units)]].to_numpy(float)
     spool = np.vstack([np.full(units, TO_TANK), spool])  # before the first command

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A report on a damaged bag: an error in one line, or numbers that JSON and the page can hold."""
+"""A report on a damaged bag: an error in one line, the true numbers, or a warning."""
 
 import json
 import random
@@ -10,12 +10,12 @@ import damage
 import pytest
 
 from fam_bundle_io.bag_writer import BagError
-from fam_bundle_io.report import reported_runs, without_nan
+from fam_bundle_io.report import ReportedRun, reported_runs, without_nan
 from fam_bundle_io.report_page import report_page
 from fam_bundle_model.parameters import load_configuration
 
 CONFIG = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
-PAGES = 20  # every so manieth case is drawn too, which takes longer
+PAGES = 20  # the first of so many cases is drawn too, which takes longer
 
 
 @pytest.fixture(scope='module')
@@ -30,8 +30,32 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     return make
 
 
+@pytest.fixture(scope='module')
+def true(whole: Callable[[str], Path]) -> Callable[[str], ReportedRun]:
+    """Return what gives the report of a whole bag, made once."""
+    known: dict[str, ReportedRun] = {}
+
+    def report(kind: str) -> ReportedRun:
+        if kind not in known:
+            (known[kind],) = reported_runs(whole(kind), kind, load_configuration(CONFIG))[0]
+        return known[kind]
+
+    return report
+
+
+def told(run: ReportedRun) -> str:
+    """Return all numbers of a run but what is of its place and its time."""
+    kept = {k: v for k, v in run.numbers.items() if k not in ('bag', 'warnings', 'timing')}
+    return json.dumps(without_nan(kept), allow_nan=False)
+
+
 @pytest.mark.parametrize('name', damage.CASES)
-def test_every_damaged_bag(name: str, whole: Callable[[str], Path], tmp_path: Path) -> None:
+def test_a_damaged_bag_gives_the_numbers_of_the_whole_one_or_a_warning(
+    name: str,
+    whole: Callable[[str], Path],
+    true: Callable[[str], ReportedRun],
+    tmp_path: Path,
+) -> None:
     case = damage.CASES[name]
     path = case.make(whole(case.of), tmp_path / 'bag', random.Random(name))
     try:
@@ -39,17 +63,11 @@ def test_every_damaged_bag(name: str, whole: Callable[[str], Path], tmp_path: Pa
     except BagError as error:
         assert '\n' not in f'{error}'
         return
-    assert runs or warnings
+    expected = true(case.of)
     for run in runs:
-        json.dumps(without_nan(run.numbers), allow_nan=False)
+        new = set(run.numbers['warnings']) - set(expected.numbers['warnings'])
+        unguarded = any('checksum' in words for words in run.numbers['warnings'])
+        assert new or unguarded or told(run) == told(expected)
+    assert runs or set(warnings) - set(expected.numbers['warnings'])
     if runs and list(damage.CASES).index(name) % PAGES == 0:
         assert report_page(runs, warnings).rstrip().endswith('</html>')
-
-
-def test_whole_bags_give_no_warning_but_that_of_a_short_run(
-    whole: Callable[[str], Path],
-) -> None:
-    for kind in damage.WHOLE:
-        runs, _ = reported_runs(whole(kind), kind, load_configuration(CONFIG))
-        for run in runs:
-            assert run.numbers['ticks'] == damage.TICKS, kind
