@@ -29,11 +29,13 @@ from fam_bundle_bringup.bridge_verdicts import (
     listen_for,
     reset_and_armed,
     said,
+    vented_to,
     went_safe,
 )
+from fam_bundle_bringup.faulty_bridge import SHUTDOWN
 from fam_bundle_bringup.graph import BRIDGE
 from fam_bundle_bringup.process_faults import STOPPED, WAITS
-from fam_bundle_bringup.verdicts import Fault, both
+from fam_bundle_bringup.verdicts import VENTED, Fault, both
 from fam_bundle_io.hardware.calibration import (
     FORCE,
     MU_PRESSURE,
@@ -42,6 +44,7 @@ from fam_bundle_io.hardware.calibration import (
     STRAIN,
 )
 from fam_bundle_io.hardware.limits import Limits
+from fam_bundle_node.loop_node import LOOK_PERIOD
 
 NAME = BRIDGE[1]
 LIMITS = Limits()  # the defaults, which the rig has too
@@ -57,6 +60,8 @@ CHANNELS = {
 FORCE_OR_FLOW = {'force': FORCE, 'flow': SOURCE_FLOW}
 SILENT = 0.06  # s without commands: stale, not lost
 RAMP = 3  # steps that tell a ramp from a step
+SLOW = 0.02  # spool that fills a unit without haste
+TRANSITIONS = ('deactivate', 'shutdown')
 MANY = 30  # bad commands in a row
 
 
@@ -286,7 +291,9 @@ def lost(fault: str, channel: int, samples: int, within: float = PROMPT) -> Hurt
     def hurt(rig: BridgeRig) -> Found:
         since = rig.inject(fault, channel)
         name = rig.calibration.names()[channel]
-        return faulted(rig, since, name, within, samples)
+        found = faulted(rig, since, name, within, samples)
+        rig.inject('')
+        return both(found, reset_and_armed(rig))
 
     return hurt
 
@@ -488,7 +495,8 @@ def stop(rig: BridgeRig) -> Found:
     found = went_safe(rig, since, LIMITS.watchdog_timeout + MARGIN)
     rig.hurt = since, since  # the bridge was held up on purpose
     expired = rig.first('expire', since) is not None
-    return both(found, ('by the watchdog', expired), said(rig, since, ''), latched(rig))
+    reason = said(rig, since, 'read took', 'watchdog')
+    return both(found, ('by the watchdog', expired), reason, latched(rig))
 
 
 # ---- Errors in the bridge itself ----
@@ -496,72 +504,97 @@ def stop(rig: BridgeRig) -> Found:
 
 def of_callbacks(folder: Path) -> Iterator[Fault]:
     """Yield errors that nobody expects, in every callback and in the thread of the card."""
-    yield broken(folder, 'shutdown', "ROS's context is shut down", None, 130)
-    yield broken(folder, 'on_valve_command', 'error in on_valve_command', None)
-    for name in ('arm', 'disarm', 'zero', 'reset_fault', 'emergency_stop'):
-        called = triggered(name)
-        yield broken(folder, f'on_{name}', f'error in on_{name}', called)
-    for name in ('deactivate', 'shutdown'):
-        yield broken(folder, f'on_{name}', f'error in on_{name}', changed(name))
-    yield broken(folder, 'look_after', 'error in the timer of the reports', None, 1)
-    yield broken(folder, 'publish_state', 'error in the thread of the card', None, 1)
-    yield broken(folder, 'Monitor._read', 'error within a tick', None)
+    yield in_broken_bridge(
+        "ROS's context is shut down",
+        f'safe volts within {AT_TANK * MS:g} ms; the process ends with status 130',
+        folder / f'break_{SHUTDOWN}',
+        shut_down_under_it(folder / f'break_{SHUTDOWN}'),
+    )
+    for method, name in (
+        ('on_valve_command', 'error in on_valve_command'),
+        ('Monitor._read', 'error within a tick'),
+        ('on_arm', 'error in on_arm'),
+        ('on_disarm', 'error in on_disarm'),
+        ('on_zero', 'error in on_zero'),
+        ('on_reset_fault', 'error in on_reset_fault'),
+        ('on_emergency_stop', 'error in on_emergency_stop'),
+        ('on_deactivate', 'error in on_deactivate'),
+        ('on_shutdown', 'error in on_shutdown'),
+    ):
+        trigger = folder / f'break_{method}'
+        expected = at_once('the error is a fault')
+        yield in_broken_bridge(name, expected, trigger, is_a_fault(method, trigger))
+    for method, name, within in (
+        ('publish_state', 'error in the thread of the card', PROMPT),
+        ('look_after', 'error in the timer of the reports', LOOK_PERIOD + PROMPT),
+    ):
+        trigger = folder / f'break_{method}'
+        expected = (
+            f'safe volts within {within * MS:g} ms, reason in bridge_state; '
+            'the process ends with status 1'
+        )
+        yield in_broken_bridge(name, expected, trigger, ends_it(trigger, within))
 
 
-def triggered(name: str) -> Callable[[BridgeRig], Any]:
-    """Return how to call a service."""
-    return lambda rig: rig.trigger(name)
-
-
-def changed(name: str) -> Callable[[BridgeRig], Any]:
-    """Return how to ask for a transition."""
-    return lambda rig: rig.change(name)
-
-
-def broken(
-    folder: Path,
-    method: str,
-    name: str,
-    call: Callable[[BridgeRig], Any] | None,
-    status: int | None = None,
-) -> Fault:
-    """Return the fault that a method raises, which ``call`` calls if nobody else does.
-
-    ``status`` is that of the process where it must end.
-    """
-    trigger = folder / f'break_{method}'
+def in_broken_bridge(name: str, expected: str, trigger: Path, hurt: Hurt) -> Fault:
+    """Return the fault that the method in the name of ``trigger`` breaks when that exists."""
 
     def start(rig: BridgeRig) -> None:
         trigger.unlink(missing_ok=True)
-        rig.start_alone(method, str(trigger))
+        rig.start_alone(trigger.name.removeprefix('break_'), str(trigger))
+
+    return Fault(name, expected, hurt, start)
+
+
+def shut_down_under_it(trigger: Path) -> Hurt:
+    """Return how to shut ROS down in the process of the bridge."""
 
     def hurt(rig: BridgeRig) -> Found:
-        if status is not None:
-            rig.may_end.add(NAME)
+        rig.may_end.add(NAME)
         since = time.monotonic_ns()
         trigger.touch()
-        if call is not None:
-            call(rig)
-        if status == 130:
-            return both(went_safe(rig, since, AT_TANK + MARGIN), ended(rig, status))
-        safe = went_safe(rig, since, PROMPT + (0.05 if method == 'look_after' else 0.0))
-        rig.wait_for(lambda: bool(rig.fault(since)), 'the reason in bridge_state', 5.0)
-        reason = rig.fault(since)
-        found = both(safe, (f'"{reason}"', 'on purpose' in reason or 'transition' in reason))
-        if status is not None:
-            return both(found, ended(rig, status))
-        shown = rig.reason(since, reason)
-        trigger.unlink()
-        return both(
-            found, ('on /diagnostics' if shown else 'not shown', bool(shown)), latched(rig)
-        )
+        return both(went_safe(rig, since, AT_TANK), ended(rig, 130))
 
-    expected = (
-        at_once('the error is a fault')
-        if status is None
-        else f'safe volts within {AT_TANK * MS:g} ms; the process ends with status {status}'
-    )
-    return Fault(name, expected, hurt, start)
+    return hurt
+
+
+def is_a_fault(method: str, trigger: Path) -> Hurt:
+    """Return how to let a method raise; what calls it is called once."""
+
+    def hurt(rig: BridgeRig) -> Found:
+        since = time.monotonic_ns()
+        trigger.touch()
+        name = method.removeprefix('on_')
+        if name in TRANSITIONS:
+            rig.change(name)
+            since = rig.called_at
+        elif method.startswith('on_') and name != 'valve_command':
+            rig.trigger(name)
+            since = rig.called_at
+        found = went_safe(rig, since, PROMPT)
+        word = 'transition' if name in TRANSITIONS else 'raised on purpose'
+        reason = said(rig, since, word)
+        trigger.unlink()
+        if name in TRANSITIONS:  # which let go of the card; the fault outlives that
+            rig.change('configure')
+            rig.change('activate')
+        return both(found, reason, latched(rig))
+
+    return hurt
+
+
+def ends_it(trigger: Path, within: float) -> Hurt:
+    """Return how to let a method raise without which the node cannot go on."""
+
+    def hurt(rig: BridgeRig) -> Found:
+        rig.may_end.add(NAME)
+        since = time.monotonic_ns()
+        trigger.touch()
+        found = both(went_safe(rig, since, within), ended(rig, 1))
+        reason = rig.fault(since)
+        return both(found, (f'"{reason}"', 'raised on purpose' in reason))
+
+    return hurt
 
 
 # ---- Operation ----
@@ -592,15 +625,15 @@ def of_operation() -> Iterator[Fault]:
 
 def emergency_stop(rig: BridgeRig) -> Found:
     """Stop everything."""
-    since = time.monotonic_ns()
     rig.trigger('emergency_stop')
+    since = rig.called_at
     return faulted(rig, since, 'emergency stop')
 
 
 def disarm(rig: BridgeRig) -> Found:
     """Disarm, and arm again."""
-    since = time.monotonic_ns()
     rig.trigger('disarm')
+    since = rig.called_at
     found = went_safe(rig, since, PROMPT)
     rig.arm()
     return both(found, ('runs again after arm', True))
@@ -608,8 +641,8 @@ def disarm(rig: BridgeRig) -> Found:
 
 def deactivate(rig: BridgeRig) -> Found:
     """Deactivate, and go back."""
-    since = time.monotonic_ns()
     done = rig.change('deactivate')
+    since = rig.called_at
     found = went_safe(rig, since, PROMPT)
     refused, _ = rig.trigger('arm')
     rig.change('activate')
@@ -626,8 +659,8 @@ def cleanup(rig: BridgeRig) -> Found:
 
 def cleanup_in_order(rig: BridgeRig) -> Found:
     """Deactivate, let go of the card, and begin anew."""
-    since = time.monotonic_ns()
     rig.change('deactivate')
+    since = rig.called_at
     done = rig.change('cleanup')
     found = went_safe(rig, since, PROMPT)
     listen_for(rig, lambda: rig.state() == 'unconfigured', 2.0)
@@ -644,15 +677,15 @@ def cleanup_in_order(rig: BridgeRig) -> Found:
 def shut_down(rig: BridgeRig) -> Found:
     """Shut the node down."""
     rig.may_end.add(NAME)
-    since = time.monotonic_ns()
     rig.change('shutdown')
+    since = rig.called_at
     return both(went_safe(rig, since, PROMPT), ended(rig, 0))
 
 
 def reset_under_pressure(rig: BridgeRig) -> Found:
     """Try to reset at once."""
-    since = time.monotonic_ns()
     rig.trigger('emergency_stop')
+    since = rig.called_at
     early, words = rig.trigger('reset_fault')
     pressure = float(rig.log()['pressure'][-1].max())
     found = faulted(rig, since, 'emergency stop')
@@ -666,35 +699,51 @@ def reset_under_pressure(rig: BridgeRig) -> Found:
 
 def unseen() -> Iterator[Fault]:
     """Yield faults that only a test of each channel finds."""
-    expected = (
-        'cannot be told by the bridge (check-channels does); the safe volts come all the same'
-    )
-    for name, fault, channels in (
-        ('coil of valve 1 dead', 'valve_dead', (0,)),
-        ('wire of valve 1 open', 'output_open', (0,)),
-        ('wire of valve 1 shorted', 'output_rail', (0,)),
-        ('output of valve 1 frozen', 'output_frozen', (0,)),
+    come = 'cannot be told by the bridge (check-channels does); the safe volts come all the same'
+    for name, fault in (
+        ('coil of valve 1 dead: its spool in the middle', 'valve_dead'),
+        ('wire of valve 1 open: its spool in the middle', 'output_open'),
+        ('output of valve 1 frozen', 'output_frozen'),
+        ('wire of valve 1 shorted: unit 1 open to the source', 'output_rail'),
     ):
-        words = f'{expected}; unit 1 is not vented: the dump valve is for that'
-        yield alone(name, words, not_told(fault, channels, vents=False))
+        expected = f'{come}; unit 1 is not vented by them: the dump valve is for that'
+        yield alone(name, expected, stuck(fault))
     for name, fault, channels in (
         ('valves 1 and 2 swapped', 'outputs_swapped', (0, 1)),
         ('pressures 1 and 2 swapped', 'inputs_swapped', (MU_PRESSURE, MU_PRESSURE + 1)),
     ):
-        yield alone(name, expected, not_told(fault, channels, vents=True))
+        yield alone(name, come, swapped(fault, channels))
 
 
-def not_told(fault: str, channels: tuple[int, ...], *, vents: bool) -> Hurt:
-    """Return how to break wires of a rig that is disarmed and vented, and to run it then."""
+def stuck(fault: str) -> Hurt:
+    """Return how to let valve 1 stick; what the rig does then may be a fault of its own."""
+
+    def hurt(rig: BridgeRig) -> Found:
+        since = rig.inject(fault, 0)
+        rig.listen(AFTER)
+        seen = rig.fault(since) or 'nothing'
+        named = 'valve' in seen
+        rig.trigger('emergency_stop')
+        safe = went_safe(rig, rig.called_at, PROMPT, vents=False)
+        full = vented_to(rig, rig.called_at)
+        words = f'unit 1 at {full:.0%} of nominal'
+        return both((f'the bridge sees: {seen}', not named), safe, (words, full > VENTED))
+
+    return hurt
+
+
+def swapped(fault: str, channels: tuple[int, ...]) -> Hurt:
+    """Return how to swap wires of a rig that is disarmed and vented, and to run it then."""
 
     def hurt(rig: BridgeRig) -> Found:
         rig.trigger('disarm')
         rig.wait_for(lambda: depressurised(rig), 'a depressurised rig')
         rig.inject(fault, *channels)
+        # The wrong unit fills: slowly, for it is not the one whose pressure is looked at.
+        rig.command = lambda sample: [min(spool, SLOW) for spool in rig.gentle(sample)]
         rig.arm()
         alive = goes_on(rig, time.monotonic_ns())
-        since = time.monotonic_ns()
         rig.trigger('emergency_stop')
-        return both(alive, went_safe(rig, since, PROMPT, vents=vents))
+        return both(alive, went_safe(rig, rig.called_at, PROMPT))
 
     return hurt

@@ -39,6 +39,7 @@ ANSWER_SHARE = 0.5  # calls of the card take a tenth of a period here, through a
 PRIORITY = 10  # of all processes, as on a rig; without the right rows are repeated more often
 STEP = 4e-4  # V; a converter of 16 bits over 20 V has steps of 0.3 mV
 GENTLE = 0.45  # of the nominal pressure, that the stand-in keeps in the first motor unit
+FILL = 0.5  # s until then; faster, the second unit sucks its oil in and reads like an open wire
 
 Log = npt.NDArray[np.void]
 Command = Callable[[Any], list[float]]  # what a controller makes of a bundle_state
@@ -107,6 +108,7 @@ class BridgeRig(Rig):
         self.orders: list[list[float]] = []
         self.vent = False
         self.answered_at = 0  # ns, steady
+        self.called_at = 0  # when the newest call of a service went out
         self.hurt = 0, 0  # from when to when (ns) it went safe, or had to go on
 
     def __exit__(
@@ -184,7 +186,8 @@ class BridgeRig(Rig):
 
     def gentle(self, sample: Any) -> list[float]:
         """Keep some pressure in the first motor unit, and none in the others."""
-        wanted = GENTLE * self.configuration.source.nominal_pressure
+        share = min(sample.tick * self.configuration.simulation.period / FILL, 1.0)
+        wanted = GENTLE * share * self.configuration.source.nominal_pressure
         gain = self.configuration.pressure_loop.proportional_gain
         spool = gain * (wanted - sample.mu_pressure[0])
         return [min(max(spool, -1.0), 1.0)] + [-1.0] * (len(sample.mu_pressure) - 1)
@@ -199,7 +202,7 @@ class BridgeRig(Rig):
         end, words = time.monotonic() + PATIENCE, ''
         while time.monotonic() < end:
             done, words = self.trigger('arm')
-            if done and self.is_quiet():
+            if done and self.is_quiet(end):
                 return
             if self.state() == 'fault':
                 words = self.newest().fault
@@ -215,6 +218,7 @@ class BridgeRig(Rig):
         client = self.node.create_client(kind, f'{BRIDGE[1]}/{name}')
         try:
             self.wait_for(client.service_is_ready, name)
+            self.called_at = time.monotonic_ns()  # the middleware may take long to find a service
             future = client.call_async(request)
             self.wait_for(future.done, f'the answer of {name}')
             return future.result()
@@ -305,13 +309,13 @@ class BridgeRig(Rig):
         after = moved[-1] + 1 if moved.size else 0
         return int(rows['time'][after]) if after < len(rows) else None
 
-    def is_quiet(self) -> bool:
+    def is_quiet(self, end: float) -> bool:
         """Return whether valves follow commands at last, and nothing holds them up for a while.
 
-        False when the bridge is not armed any more.
+        False when the bridge is not armed any more, or at the time ``end`` (s, steady).
         """
-        self.listen(0.1)
-        while self.state() in ('armed', 'active'):
+        self.listen(FILL)
+        while self.state() in ('armed', 'active') and time.monotonic() < end:
             since = time.monotonic_ns()
             self.listen(QUIET)
             rows = self.log(since)

@@ -19,7 +19,9 @@ Found = tuple[str, bool]
 
 MARGIN = 0.01  # s for a machine that is not disturbed: cycles under way, wake-ups
 PROMPT = 0.02  # s: at once, for a loop of 1 ms whose reads may come late
-AFTER = 0.8  # s of watching that nothing moves, and of waiting for the rig to vent
+AFTER = 0.8  # s of watching that nothing moves
+VENTING = 3.0  # s that a full rig gets to vent
+LAST = 100  # reports; a channel that jumps about is right now and then
 REPORT = 3.0  # s in which a reason must stand on /diagnostics; a report comes once a second
 
 
@@ -37,11 +39,18 @@ def went_safe(
         return 'valves moved again', False
     took, reads = (at - since) * 1e-9, reads_between(rig, since, at)
     rig.hurt = since, at
-    low = float(rig.log(at)['pressure'].max(axis=1).min())
-    share = low / rig.configuration.source.nominal_pressure
+    if vents:
+        listen_for(rig, lambda: vented_to(rig, at) < VENTED, VENTING)
+    share = vented_to(rig, at)
     words = f'safe volts out after {took * 1e3:.1f} ms, {reads} samples; vented to {share:.1%}'
     passed = took <= within and reads <= samples
     return words, passed and (share < VENTED or not vents)
+
+
+def vented_to(rig: BridgeRig, since: int) -> float:
+    """Return the lowest that the fullest motor unit came to since then (ns), over nominal."""
+    low = float(rig.log(since)['pressure'].max(axis=1).min())
+    return low / rig.configuration.source.nominal_pressure
 
 
 def reads_between(rig: BridgeRig, since: int, until: int) -> int:
@@ -50,11 +59,11 @@ def reads_between(rig: BridgeRig, since: int, until: int) -> int:
     return int(np.count_nonzero((rows['event'] == b'read') & (rows['time'] < until)))
 
 
-def said(rig: BridgeRig, since: int, word: str) -> Found:
-    """Return whether the bridge says ``word`` as its fault, in bridge_state and diagnostics."""
-    listen_for(rig, lambda: word in rig.fault(since) and bool(rig.reason(since, word)), REPORT)
-    fault, report = rig.fault(since), rig.reason(since, word)
-    if word not in fault:
+def said(rig: BridgeRig, since: int, *words: str) -> Found:
+    """Return whether the bridge says one of ``words``, in bridge_state and on /diagnostics."""
+    listen_for(rig, lambda: bool(rig.fault(since) and rig.reason(since, *words)), REPORT)
+    fault, report = rig.fault(since), rig.reason(since, *words)
+    if not any(word in fault for word in words):
         return f'bridge_state says "{fault}"', False
     return f'"{fault}"' + ('' if report else ', not on /diagnostics'), bool(report)
 
@@ -134,9 +143,9 @@ def degraded(rig: BridgeRig, since: int, channel: int) -> Found:
     alive = goes_on(rig, since, 1.2)
     marks = np.array([s.message.degraded for s in rig.reported(since)])
     others = np.delete(marks, channel, axis=1).any()
-    share = float(marks[:, channel].mean())
-    words = f'marked as degraded in {share:.0%} of the reports, then on'
-    return both(alive, (words, bool(marks[-1, channel]) and not others))
+    share = float(marks[-LAST:, channel].mean())
+    words = f'marked as degraded in {share:.0%} of the last {LAST} reports'
+    return both(alive, (words, share > 0.5 and not others))
 
 
 def beyond_limit(rig: BridgeRig, since: int) -> tuple[int, int] | None:

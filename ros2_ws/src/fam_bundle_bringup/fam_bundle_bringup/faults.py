@@ -75,6 +75,13 @@ def all_faults(folder: Path) -> Iterator[Fault]:
         yield without_shared_memory(name)
 
 
+def faults_of_bridge(folder: Path) -> Iterator[Fault]:
+    """Yield every fault of the hardware bridge; ``folder`` is for what they need."""
+    from fam_bundle_bringup.bridge_faults import bridge_faults
+
+    yield from bridge_faults(folder)
+
+
 def tried(fault: Fault, configuration: Configuration, folder: Path) -> Row:
     """Do one fault to a graph of its own, and return its row."""
     try:
@@ -115,13 +122,11 @@ def run_faults(
     ``bridge`` asks for those of the hardware bridge, on the simulated rig in volts. Returns
     whether all passed.
     """
-    from fam_bundle_bringup.bridge_faults import bridge_faults
-
     reference = dataclasses.replace(configuration.reference, cycles=LONG)
     run = dataclasses.replace(configuration.run, pace='realtime')
     long_run = dataclasses.replace(configuration, reference=reference, run=run)
-    every, attempt = (bridge_faults, tried_at_bridge) if bridge else (all_faults, tried)
-    chosen = [f for f in every(folder) if only in f.name]
+    attempt = tried_at_bridge if bridge else tried
+    chosen = [f for f in (faults_of_bridge if bridge else all_faults)(folder) if only in f.name]
     if not chosen:
         raise ConfigurationError(f'--only {only}: no such fault')
     rows = []

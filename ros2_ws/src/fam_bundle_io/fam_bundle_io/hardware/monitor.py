@@ -232,6 +232,7 @@ class Monitor:
             self._tick(spool, stamp)
         except Exception as error:
             self._fail(_words(error))
+            self._pause()
         except BaseException as error:
             self._fail(_words(error))
             raise
@@ -281,8 +282,7 @@ class Monitor:
             self._backend.read(sample.volts)
         except Exception as error:
             self._fail(f'read: {_words(error)}')
-            if self._clock is not None:
-                time.sleep(self._setup.period)  # the card does not pace a loop that it refuses
+            self._pause()
             return
         sample.tick += 1
         now = sample.time = self.now()
@@ -301,6 +301,10 @@ class Monitor:
             self._fail(reason)
         if self.zeroing is not None and not self.zeroing.done():
             self._zero()
+
+    def _pause(self) -> None:
+        if self._clock is not None:
+            time.sleep(self._setup.period)  # a card that is not read does not pace the loop
 
     def _zero(self) -> None:
         zeroing = self.zeroing

@@ -18,14 +18,17 @@ from fam_bundle_io.hardware.limits import Limits
 
 # Without these the loop goes on, with the last good value.
 EXPENDABLE = (FORCE, SOURCE_FLOW)
+# Times ``sensor_samples``, for which a channel that came back elsewhere must be steady.
+STEADY = 2
 
 
 class SensorWatch:
     """Holds the last good value of each channel, and says when one is lost.
 
     A sample is no measurement while its volts are outside the live range, have not changed in
-    the last bit for too long, or its value moved faster than the rig can. ``degraded``
-    (channels,) marks the expendable channels that are lost now.
+    the last bit for too long, or its value is farther from the last good one than the rig can
+    go in a sample. One that is steady for long enough measures again, wherever it is: the rig
+    has moved meanwhile. ``degraded`` (channels,) marks the expendable channels that are lost now.
     """
 
     def __init__(self, calibration: Calibration, limits: Limits) -> None:
@@ -50,6 +53,8 @@ class SensorWatch:
         self._equal = np.zeros(count, dtype=np.int64)  # to the sample before, in a row
         self._new = np.ones(count, dtype=np.bool_)  # has had no good value yet
         self._before: Volts = np.full(count, np.nan)
+        self._last: Values = np.full(count, np.nan)
+        self._steady = np.zeros(count, dtype=np.int64)  # samples without a jump, in a row
         self._room: Values = np.empty(count)
         self._step: Values = np.empty(count)
         self._well = np.empty(count, dtype=np.bool_)
@@ -60,8 +65,10 @@ class SensorWatch:
         """Take the next sample as the first: the scaling, or the card, is another now."""
         self._new.fill(True)
         self._before.fill(np.nan)
+        self._last.fill(np.nan)
         self.bad.fill(0)
         self._equal.fill(0)
+        self._steady.fill(0)
         self.degraded.fill(False)
         self.has_values = self.measuring = False
 
@@ -95,6 +102,14 @@ class SensorWatch:
         np.multiply(self._equal, self._flag, out=self._equal)
         np.copyto(self._before, volts)
 
+    def _count_steady(self, values: Values) -> None:
+        np.subtract(values, self._last, out=self._step)
+        np.abs(self._step, out=self._step)
+        np.less_equal(self._step, self._room, out=self._flag)
+        np.add(self._steady, 1, out=self._steady)
+        np.multiply(self._steady, self._flag, out=self._steady)
+        np.copyto(self._last, values)
+
     def _count_bad(self) -> None:
         """Count bad samples up and good ones down: a loose contact adds up, a spike does not."""
         for _ in range(2):
@@ -108,10 +123,13 @@ class SensorWatch:
         """Fill ``_well``; comparisons with NaN are false, so NaN is not well."""
         well, flag = self._well, self._flag
         np.multiply(self.rate, elapsed, out=self._room)
+        self._count_steady(values)
         np.subtract(values, self.good, out=self._step)
         np.abs(self._step, out=self._step)
         np.less_equal(self._step, self._room, out=well)
         np.logical_or(well, self._new, out=well)
+        np.greater_equal(self._steady, STEADY * self.limits.sensor_samples, out=flag)
+        np.logical_or(well, flag, out=well)
         np.greater_equal(volts, self.live_minimum, out=flag)
         np.logical_and(well, flag, out=well)
         np.less_equal(volts, self.live_maximum, out=flag)

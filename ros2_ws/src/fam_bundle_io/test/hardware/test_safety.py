@@ -256,6 +256,23 @@ def test_a_value_that_moves_faster_than_the_rig_is_a_jump(sensors, channel):
 
 
 @pytest.mark.parametrize('channel', ESSENTIAL)
+def test_a_channel_that_comes_back_elsewhere_measures_again_once_it_is_steady(sensors, channel):
+    """Else no fault of a sensor could be reset after the rig has vented."""
+    for _ in range(100):
+        reason, _ = sensors.look(volts={channel: DEAD[channel]})
+    assert reason
+    elsewhere = {channel: WELL[channel] + 2.0 * JUMPS[channel]}
+    measuring = []
+    for _ in range(20):
+        _, values = sensors.look(elsewhere)
+        measuring.append(sensors.watch.measuring)
+    # 8 samples without a step after the one that came back.
+    assert measuring == [False] * 8 + [True] * 12
+    assert values[channel] == pytest.approx(elsewhere[channel], rel=1e-6)
+    assert sensors.look(elsewhere)[0] == ''
+
+
+@pytest.mark.parametrize('channel', ESSENTIAL)
 def test_one_spike_is_left_out_and_the_loop_goes_on(sensors, channel):
     reason, values = sensors.look({channel: WELL[channel] + JUMPS[channel]})
     assert reason == '' and values == pytest.approx(WELL, rel=1e-6)
