@@ -37,6 +37,10 @@ class Declaration:
     choices: tuple[str, ...] = ()
     array: bool = False
 
+    def is_free_text(self) -> bool:
+        """Return whether any text will do that is not blank."""
+        return self.kind is str and not self.choices
+
     def bound(self) -> str:
         """Return the allowed range in words."""
         if self.choices:

