@@ -322,8 +322,10 @@ def test_outputs_that_cannot_be_written_are_left_to_the_watchdog(on: Any) -> Non
 
 SIGNALLED = """
 import atexit, os, signal, sys
+default = signal.default_int_handler if '{name}' == 'SIGINT' else signal.SIG_DFL
 sys.path.insert(0, {tests!r})
 from test_rig_commands import WatchedRig, main, rig_commands
+signal.signal(signal.{name}, default)  # a parent may have had it ignored
 rig = WatchedRig()
 rig_commands.load_backend = lambda name: rig
 rig.at_sample[2250] = lambda broken: os.kill(os.getpid(), signal.{name})
