@@ -56,12 +56,13 @@ if TYPE_CHECKING:
 
 FILES = ('replay.json', 'replay.png', 'replay.pdf')
 SAMPLES, LAG_TABLE = 'bundle_state', 'lag_table'
+STAMP = ('header.stamp.sec', 'header.stamp.nanosec')
 # Fields without which nothing can be replayed; what else is recorded is only compared.
 NEEDED = {
-    SAMPLES: ('safe', 'strain', 'force', 'source_pressure', 'mu_pressure[0]'),
+    SAMPLES: (*STAMP, 'safe', 'strain', 'force', 'source_pressure', 'mu_pressure[0]'),
     REFERENCE: ('pressure',),
     STATE: ('recruited', 'pressure_compensation'),
-    COMMAND: ('vent', 'spool[0]'),
+    COMMAND: (*STAMP, 'vent', 'spool[0]'),
 }
 
 
@@ -140,20 +141,42 @@ def tables_of(bag: Bag, space: str) -> 'tuple[dict[str, pd.DataFrame], list[str]
     if f'{space}/{SAMPLES}' not in bag.types:
         hint = f'; its bundles are {", ".join(others)}' if others else ''
         raise BagError(f'{space}/{SAMPLES}: not in the bag{hint}')
-    notes = list(bag.warnings)
-    missing = bag.records.get('fam_bundle.completeness', {}).get('missing', '[]')
-    notes += [f'recorder: {line}' for line in json.loads(missing)]
+    notes = [*bag.warnings, *said_by_recorder(bag)]
     tables, warnings = run_tables(bag, space)
     runs = int(runs_of(bag.tables[f'{space}/{SAMPLES}'])[-1]) + 1
     if runs > 1:
         notes.append(f'{runs} runs in the bag: the last is replayed')
     found = {LOOP[name]: table for name, table in tables.items()}
     for topic, table in found.items():
-        lacking = [name for name in NEEDED[topic] if name not in table]
-        if lacking:
-            raise BagError(f'{space}/{topic}: has no {lacking[0]}')
+        for name in NEEDED[topic]:
+            if name not in table:
+                raise BagError(f'{space}/{topic}: has no {name}')
+            if table[name].dtype.kind not in 'biuf':
+                raise BagError(f'{space}/{topic}: {name} is no number')
+        possible = table.index <= np.iinfo(np.int64).max
+        if not possible.all():
+            notes.append(f'{topic}: {int((~possible).sum())} messages of no possible tick')
+            found[topic] = table[possible]
+    units, spools = (
+        sum(name.startswith(f'{field}[') for name in found.get(topic, ()))
+        for topic, field in ((SAMPLES, 'mu_pressure'), (COMMAND, 'spool'))
+    )
+    if COMMAND in found and spools != units:
+        raise BagError(f'{space}/{COMMAND}: {spools} spools of {units} motor units')
     found[SAMPLES] = found[SAMPLES].sort_index()
     return found, notes + warnings
+
+
+def said_by_recorder(bag: Bag) -> list[str]:
+    """Return what the recorder noted as missing."""
+    text = bag.records.get('fam_bundle.completeness', {}).get('missing', '[]')
+    try:
+        missing = json.loads(text)
+    except ValueError:
+        missing = None
+    if not isinstance(missing, list):
+        return ['recorder: what it noted as missing cannot be read']
+    return [f'recorder: {line}' for line in missing]
 
 
 def check_units(chosen: Chosen, table: 'pd.DataFrame') -> None:

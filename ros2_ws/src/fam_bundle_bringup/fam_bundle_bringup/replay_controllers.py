@@ -24,6 +24,7 @@ from fam_bundle_control.recruitment import (
 )
 from fam_bundle_control.reference import strain_reference
 from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
+from fam_bundle_io.bag_writer import BagError
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.compile import direct
 from fam_bundle_model.hydraulics import TO_TANK
@@ -31,6 +32,7 @@ from fam_bundle_model.lag_table import LagTable
 from fam_bundle_model.parameters import Configuration, seconds
 from fam_bundle_model.pressure_pi import pressure_gains
 from fam_bundle_node.stamps import StampClock, begins_anew, nanoseconds
+from fam_bundle_node.ticks import TickError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -380,7 +382,8 @@ def replay_controllers(
     """Return the comparison of all that the controllers answered in ``run``.
 
     Topics that are not in the bag are left out, as is the pressure controller without the
-    references that it follows. ``progress`` is called with the steps done so far.
+    references that it follows. ``progress`` is called with the steps done so far. Raises BagError
+    where stamps stand still.
     """
     samples, found, done = run.samples, list[Comparison](), 0
     for topic in run.answers:
@@ -389,7 +392,10 @@ def replay_controllers(
             if not {REFERENCE, STATE} <= set(run.answers):
                 continue
             usable &= set(run.answers[REFERENCE].index) & set(run.answers[STATE].index)
-        steps = steps_of(samples, _taken(run, topic), usable, configuration)
+        try:
+            steps = steps_of(samples, _taken(run, topic), usable, configuration)
+        except TickError as error:
+            raise BagError(f'stamps of bundle_state: {error}') from None
 
         def report(steps_done: int, before: int = done) -> None:
             if steps_done % 1000 == 0:

@@ -92,9 +92,10 @@ def measured(samples: Samples) -> dict[str, Array]:
 def deviations(seen: Mapping[str, Array], simulated: Mapping[str, Array]) -> dict[str, Deviation]:
     """Return how far the simulated signals are from those measured; not finite if they diverge."""
     found = {}
-    for name, values in simulated.items():
-        off = np.abs(values - seen[name])
-        found[name] = Deviation(float(np.sqrt(np.mean(off * off))), float(off.max()))
+    with np.errstate(over='ignore', invalid='ignore'):
+        for name, values in simulated.items():
+            off = np.abs(values - seen[name])
+            found[name] = Deviation(float(np.sqrt(np.mean(off * off))), float(off.max()))
     return found
 
 
