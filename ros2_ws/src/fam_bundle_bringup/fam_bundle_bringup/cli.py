@@ -200,13 +200,21 @@ def run_experiment_command(options: argparse.Namespace, configuration: Configura
         for state in loop['states']:
             print(f'                {state}')
     if options.record:
-        bag = metrics['bag']
-        print(
-            f'  recorded      {bag["messages"]} messages, {"; ".join(bag["missing"]) or "whole"};'
-        )
-        print(f'                recorder: {bag["cpu_share"]:.2f} of a core, ', end='')
-        print(f'{bag["peak_memory"] / 1e6:.0f} MB')
+        for line in recorded_lines(metrics['bag']):
+            print(line)
     print(f'written to {options.out}')
+
+
+def recorded_lines(bag: Mapping[str, Any]) -> list[str]:
+    """Return what is said of the bag of a run: is it whole, and what did recording take."""
+    missing, unanswered = bag['missing'] or ['whole'], sum(bag['unanswered'].values())
+    lines = [f'{bag["messages"]} messages, {"; ".join(missing)};']
+    if unanswered:
+        per_topic = (f'{count} of {name.lstrip("/")}' for name, count in bag['unanswered'].items())
+        lines.append(f'samples not answered: {", ".join(per_topic)};')
+    memory = f'{bag["peak_memory"] / 1e6:.0f} MB'
+    lines.append(f'recorder: {bag["cpu_share"]:.2f} of a core, {memory}')
+    return [f'  {"" if number else "recorded":14}{line}' for number, line in enumerate(lines)]
 
 
 def _times(times: Sequence[float]) -> str:

@@ -14,6 +14,7 @@ from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_bringup.graph import run_graph
 from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.offline import run_offline
+from fam_bundle_io.completeness import ANSWERS
 from fam_bundle_io.hardware.calibration import HardwareFile, write_hardware
 from fam_bundle_io.metrics import Tracking, shift_times, tracking
 from fam_bundle_io.trace import Trace, save_trace
@@ -132,7 +133,7 @@ def with_bridge(
 
 
 def bag_of(bag: Path) -> dict[str, Any]:
-    """Return what the recorder says of its bag: whether it is whole, and what recording took."""
+    """Return what the recorder says of its bag: what is missing, and what recording took."""
     import yaml
 
     content = yaml.safe_load((bag / 'metadata.yaml').read_text())
@@ -145,6 +146,11 @@ def bag_of(bag: Path) -> dict[str, Any]:
     return {
         'messages': said['message_count'],
         'missing': json.loads(notes['fam_bundle.completeness.missing']),
+        'unanswered': {
+            topic: json.loads(notes[f'fam_bundle.completeness.{topic}']).get('unanswered', 0)
+            for topic in (f'/{name}' for name in ANSWERS)
+            if f'fam_bundle.completeness.{topic}' in notes
+        },
         'cpu_share': cost['cpu_time'] / cost['elapsed'],
         'peak_memory': cost['peak_memory'],
     }

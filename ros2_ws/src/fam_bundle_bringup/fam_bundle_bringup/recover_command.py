@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from fam_bundle_bringup.progress import progress_bar
-from fam_bundle_io.completeness import shortcomings
+from fam_bundle_io.completeness import unanswered
 from fam_bundle_io.recover import Recovery, look, recover_bag
 
 
@@ -36,8 +36,8 @@ def words_of(recovery: Recovery) -> Iterator[str]:
     """Yield what was recovered, topic by topic, and what was not."""
     for topic, summary in recovery.topics.items():
         yield f'{topic}: {summary["count"]} messages{_ticks(summary)}'
-    yield from recovery.damage
-    yield from shortcomings(recovery.topics, 0)
+    yield from recovery.missing
+    yield from unanswered(recovery.topics)
 
 
 def _ticks(summary: dict[str, Any]) -> str:

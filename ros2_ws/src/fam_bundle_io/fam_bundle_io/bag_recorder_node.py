@@ -34,7 +34,14 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from fam_bundle_io.bag_writer import BagError, BagWriter, Item, Topic
-from fam_bundle_io.completeness import TopicLedger, carries_tick, record_of, shortcomings
+from fam_bundle_io.completeness import (
+    ANSWERS,
+    TopicLedger,
+    carries_tick,
+    is_answer,
+    record_of,
+    shortcomings,
+)
 from fam_bundle_io.message_definitions import complete_definition
 from fam_bundle_model.parameters import GROUPS, Configuration, ProcessParameters, yaml_text
 from fam_bundle_model.schema import ConfigurationError
@@ -49,7 +56,6 @@ PRIORITY_BELOW = 10  # that of the nodes of the loop
 DEPTH = 10_000  # messages of a topic that may wait for this node
 # The plant waits for its listeners, so this node becomes one when it has the others.
 STARTS_THE_RUN = 'bundle_state'
-LOOP = ('pressure_reference', 'recruitment_state', 'valve_command', STARTS_THE_RUN)
 NOBODYS = ('/rosout', '/parameter_events')  # recorded only where they are named
 PARAMETERS = {
     'folder': ('', 'folder of the bag; must not exist'),
@@ -85,6 +91,7 @@ class BagRecorder(Node):
             self.configuration = self._configuration()
             self._ledgers: dict[str, TopicLedger] = {}
             self.skipped: dict[str, str] = {}
+            self._waits: dict[str, str] = {}
             self._taps: dict[str, Subscription] = {}
             self._polled = Polled()
             self.writer = BagWriter(
@@ -129,9 +136,13 @@ class BagRecorder(Node):
         found = dict(self.get_topic_names_and_types())
         wanted = [name for name in sorted(found) if self.is_wanted(name) and self.is_offered(name)]
         wanted.sort(key=lambda name: name.endswith(STARTS_THE_RUN))
+        self._waits.clear()
         for name in wanted:
-            waits = name.endswith(STARTS_THE_RUN) and not self._has_loop_of(name)
-            if name not in self._ledgers and name not in self.skipped and not waits:
+            if name in self._ledgers or name in self.skipped:
+                continue
+            if name.endswith(STARTS_THE_RUN) and not self._has_loop_of(name):
+                self._waits[name] = 'not recorded: the other topics of the loop did not come'
+            else:
                 self.record(name, found[name][0])
 
     def is_wanted(self, name: str) -> bool:
@@ -149,7 +160,7 @@ class BagRecorder(Node):
 
     def _has_loop_of(self, state: str) -> bool:
         space = state.removesuffix(STARTS_THE_RUN)
-        loop = (f'{space}{name}' for name in LOOP if name != STARTS_THE_RUN)
+        loop = (f'{space}{name}' for name in ANSWERS)
         return all(name in self._ledgers or not self.is_wanted(name) for name in loop)
 
     def record(self, name: str, message_type: str) -> None:
@@ -159,8 +170,7 @@ class BagRecorder(Node):
             python_type = getattr(importlib.import_module(f'{package}.msg'), message)
             definition = complete_definition(message_type)
         except (ImportError, AttributeError, OSError) as error:
-            self.skipped[name] = f'{error}'
-            self.get_logger().warning(f'{name}: not recorded: {error}')
+            self._skip(name, f'not recorded: {error}')
             return
         offered = self.get_publishers_info_by_topic(name)
         topic = Topic(
@@ -170,7 +180,7 @@ class BagRecorder(Node):
             str(offered[0].topic_type_hash) if offered else '',
             tuple(qos_of(offer) for offer in offered),
         )
-        self._ledgers[name] = TopicLedger(ticks=carries_tick(definition))
+        self._ledgers[name] = TopicLedger(ticks=carries_tick(definition), answers=is_answer(name))
         self.writer.add_topic(topic)
         self._taps[name] = self.create_subscription(
             python_type,
@@ -180,6 +190,10 @@ class BagRecorder(Node):
             callback_group=self._polled,
             raw=True,
         )
+
+    def _skip(self, name: str, why: str) -> None:
+        self.skipped[name] = why
+        self.get_logger().warning(f'{name}: {why}')
 
     def take_all(self) -> bool:
         """Take what has come on all topics, and return whether anything has."""
@@ -216,7 +230,10 @@ class BagRecorder(Node):
     def close(self) -> list[str]:
         """Close the bag, return what is missing; raises BagError if the disk did not take all."""
         self.writer.close(self.records)
-        return list(shortcomings(self.summaries(), self.writer.dropped))
+        return list(shortcomings(self.summaries(), self.writer.dropped, self._lacking()))
+
+    def _lacking(self) -> dict[str, str]:
+        return self.skipped | self._waits
 
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Return what came on each topic."""
@@ -224,7 +241,7 @@ class BagRecorder(Node):
 
     def records(self) -> dict[str, dict[str, str]]:
         """Return the records of metadata that end the bag, by name."""
-        found = record_of(self.summaries(), self.writer.dropped, self.skipped)
+        found = record_of(self.summaries(), self.writer.dropped, self._lacking())
         cost = {name: f'{value:.6g}' for name, value in self.cost().items()}
         return {'fam_bundle.completeness': found, 'fam_bundle.recorder': cost}
 

@@ -11,7 +11,9 @@ from typing import Any
 # of eight, counted from the fifth byte, the tick.
 LITTLE_ENDIAN = 1
 FRAME_ID = 16
-MOST_GAPS = 20  # that are named; all are counted
+ANSWERS = ('pressure_reference', 'recruitment_state', 'valve_command')  # to bundle_state
+MOST_GAPS = 20  # that are kept; all are counted
+NAMED_GAPS = 3  # in words
 
 
 def carries_tick(definition: str) -> bool:
@@ -33,16 +35,26 @@ def tick_of(data: bytes) -> int:
     return int(tick)
 
 
+def is_answer(topic: str) -> bool:
+    """Return whether a topic of the loop answers samples: not every one, if they come late."""
+    return topic.rpartition('/')[2] in ANSWERS
+
+
 class TopicLedger:
     """Counts what came on one topic and what is missing between."""
 
-    def __init__(self, *, ticks: bool) -> None:
-        """Know nothing yet; ``ticks`` tells whether the messages carry one."""
-        self._has_ticks = ticks
+    def __init__(self, *, ticks: bool, answers: bool = False) -> None:
+        """Know nothing yet; ``ticks`` tells whether the messages carry one.
+
+        Where they are ``answers``, a tick was not answered if its publisher numbered the messages
+        around it one after the other.
+        """
+        self._has_ticks, self._answers = ticks, answers
         self._count, self._runs = 0, 0
         self._first, self._newest = -1, -1
         self._missing_ticks, self._repeated_ticks, self._without_tick = 0, 0, 0
         self._gaps: list[tuple[int, int]] = []
+        self._unanswered, self._unanswered_gaps = 0, list[tuple[int, int]]()
         self._sequence, self._lost = 0, 0
 
     def note(self, sequence: int, data: bytes) -> None:
@@ -52,28 +64,39 @@ class TopicLedger:
             return  # such a topic may have many publishers, each with numbers of its own
         if sequence > self._sequence > 0:
             self._lost += sequence - self._sequence - 1
+        numbered = self._sequence > 0 or self._count == 1
+        follows = numbered and sequence == self._sequence + 1
         self._sequence = sequence  # one that goes back is a new publisher's
         try:
             tick = tick_of(data)
         except (struct.error, IndexError):
             self._without_tick += 1
         else:
-            self._note_tick(tick)
+            self._note_tick(tick, unanswered=self._answers and follows)
 
-    def _note_tick(self, tick: int) -> None:
+    def _note_tick(self, tick: int, *, unanswered: bool) -> None:
         if tick == 0 and self._newest != 0:
             self._runs += 1
             self._first = 0 if self._first < 0 else self._first
         elif self._newest < 0:
             self._runs, self._first = 1, tick
+            if unanswered:
+                self._note_gap(0, tick - 1, unanswered=True)
         elif tick > self._newest + 1:
-            self._missing_ticks += tick - self._newest - 1
-            if len(self._gaps) < MOST_GAPS:
-                self._gaps.append((self._newest + 1, tick - 1))
+            self._note_gap(self._newest + 1, tick - 1, unanswered=unanswered)
         elif tick <= self._newest:
             self._repeated_ticks += 1
             return
         self._newest = tick
+
+    def _note_gap(self, first: int, last: int, *, unanswered: bool) -> None:
+        gaps = self._unanswered_gaps if unanswered else self._gaps
+        if unanswered:
+            self._unanswered += last - first + 1
+        else:
+            self._missing_ticks += last - first + 1
+        if len(gaps) < MOST_GAPS:
+            gaps.append((first, last))
 
     def newest_tick(self) -> int | None:
         """Return the newest tick, None where the messages carry none."""
@@ -92,6 +115,8 @@ class TopicLedger:
                 'repeated_ticks': self._repeated_ticks,
                 'without_tick': self._without_tick,
                 'gaps': self._gaps,
+                'unanswered': self._unanswered,
+                'unanswered_gaps': self._unanswered_gaps,
             }
         return found
 
@@ -106,12 +131,14 @@ def record_of(
 
     ``summaries`` are those of the topics' ledgers, ``dropped`` the messages that the disk did not
     take in time, None where nobody knows, ``skipped`` why a topic was not recorded, ``damage``
-    what was lost since, in words.
+    what was lost since, in words. ``whole`` answers whether the record is complete; that samples
+    were not answered takes nothing from it.
     """
-    missing = [*damage, *shortcomings(summaries, dropped or 0)]
+    missing = [*damage, *shortcomings(summaries, dropped or 0, skipped)]
     found: dict[str, Any] = {
         'whole': not missing,
         'missing': missing,
+        'unanswered': list(unanswered(summaries)),
         'dropped': dropped,
         'skipped_topics': dict(skipped),
         **summaries,
@@ -119,40 +146,54 @@ def record_of(
     return {name: json.dumps(value) for name, value in found.items()}
 
 
-def shortcomings(summaries: Mapping[str, dict[str, Any]], dropped: int) -> Iterator[str]:
-    """Yield in words what is missing from a record; nothing when it is whole.
-
-    A tick may be missing without being lost: a controller does not answer a stale sample. What
-    was published and not recorded shows in the sequence numbers.
-    """
+def shortcomings(
+    summaries: Mapping[str, dict[str, Any]], dropped: int, skipped: Mapping[str, str]
+) -> Iterator[str]:
+    """Yield in words what is missing from a record; nothing when it is whole."""
+    if not any(summary['count'] for summary in summaries.values()):
+        yield 'no message was recorded'
+    for topic, why in skipped.items():
+        yield f'{topic}: {why}'
     if dropped:
         yield f'{dropped} messages dropped, for the disk was too slow'
     for topic, summary in summaries.items():
         if summary.get('lost'):
             yield f'{topic}: {summary["lost"]} messages lost before they were recorded'
         if summary.get('missing_ticks'):
-            gaps = ', '.join(f'{a}-{b}' if b > a else f'{a}' for a, b in summary['gaps'])
-            yield f'{topic}: {summary["missing_ticks"]} ticks without a message ({gaps})'
+            named = _ranges(summary['gaps'])
+            yield f'{topic}: {summary["missing_ticks"]} ticks without a message ({named})'
         if summary.get('without_tick'):
             yield f'{topic}: {summary["without_tick"]} messages too short to carry a tick'
     yield from _ends(summaries)
 
 
+def unanswered(summaries: Mapping[str, dict[str, Any]]) -> Iterator[str]:
+    """Yield in words which samples were not answered, as sequence numbers prove."""
+    for topic, summary in summaries.items():
+        if summary.get('unanswered'):
+            named = _ranges(summary['unanswered_gaps'])
+            yield f'{topic}: {summary["unanswered"]} samples were not answered ({named})'
+
+
+def _ranges(gaps: Sequence[tuple[int, int]]) -> str:
+    named = [f'{a}-{b}' if b > a else f'{a}' for a, b in gaps[:NAMED_GAPS]]
+    return ', '.join([*named, '...'] if len(gaps) > NAMED_GAPS else named)
+
+
 def _ends(summaries: Mapping[str, dict[str, Any]]) -> Iterator[str]:
-    """Yield which topics of a bundle begin later or end earlier than the others.
+    """Yield which topics begin later than with tick 0, or end earlier than others of a bundle.
 
     That shows neither in their own ticks nor in their sequence numbers.
     """
-    bundles: dict[str, dict[str, tuple[int, int]]] = {}
+    bundles: dict[str, dict[str, int]] = {}
     for topic, summary in summaries.items():
         if summary.get('last_tick', -1) >= 0:
-            ends = summary['first_tick'], summary['last_tick']
-            bundles.setdefault(topic.rpartition('/')[0], {})[topic] = ends
+            bundles.setdefault(topic.rpartition('/')[0], {})[topic] = summary['last_tick']
+            first = summary['first_tick']
+            if first > 0 and (0, first - 1) not in summary['unanswered_gaps']:
+                yield f'{topic}: begins with tick {first}'
     for topics in bundles.values():
-        first = min(begin for begin, _ in topics.values())
-        last = max(end for _, end in topics.values())
-        for topic, (begin, end) in topics.items():
-            if begin > first:
-                yield f'{topic}: begins with tick {begin}, the others with {first}'
+        last = max(topics.values())
+        for topic, end in topics.items():
             if end < last:
                 yield f'{topic}: ends with tick {end}, the others with {last}'

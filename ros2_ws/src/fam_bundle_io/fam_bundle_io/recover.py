@@ -8,9 +8,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fam_bundle_io.bag_files import read_parts
-from fam_bundle_io.bag_parts import Damage, Messages, Part, Records
+from fam_bundle_io.bag_parts import Damage, Messages, Part
 from fam_bundle_io.bag_writer import BagError, BagFolder, Item, Topic
-from fam_bundle_io.completeness import TopicLedger, carries_tick, record_of
+from fam_bundle_io.completeness import (
+    TopicLedger,
+    carries_tick,
+    is_answer,
+    record_of,
+)
 
 COMPLETENESS, RECOVERY = 'fam_bundle.completeness', 'fam_bundle.recovery'
 STEP = 10_000  # messages between two words of progress
@@ -35,10 +40,14 @@ def look(bag: Path) -> Found:
 
 
 class Recovery(NamedTuple):
-    """What was written: a ledger's summary for each topic, and in words what was lost."""
+    """What was written: a ledger's summary for each topic, and in words what was lost.
+
+    ``missing`` is all that the new bag lacks, also of what was missing before it was damaged.
+    """
 
     topics: dict[str, dict[str, Any]]
     damage: list[str]
+    missing: list[str]
 
 
 def recover_bag(
@@ -88,8 +97,9 @@ class _Recoverer:
         if self.timeless:
             self.damage.append(f'{self.timeless} messages of no possible time are left out')
         summaries = {name: ledger.summary() for name, ledger in self.ledgers.items()}
-        self.folder.close(self.records | self.said_of_itself(summaries))
-        return Recovery(summaries, self.damage)
+        said = self.said_of_itself(summaries)
+        self.folder.close(self.records | said)
+        return Recovery(summaries, self.damage, json.loads(said[COMPLETENESS]['missing']))
 
     def take(self, part: Part) -> None:
         """Copy messages, and note all else."""
@@ -115,7 +125,9 @@ class _Recoverer:
                 _profiles(messages.qos),
             )
             self.topics[known.name] = known
-            self.ledgers[known.name] = TopicLedger(ticks=carries_tick(definition))
+            self.ledgers[known.name] = TopicLedger(
+                ticks=carries_tick(definition), answers=is_answer(known.name)
+            )
             self.folder.add_topic(known)
         same = (messages.type, messages.definition) == (known.type, known.definition)
         if not same:
@@ -135,7 +147,7 @@ class _Recoverer:
         if self.count % STEP == 0:
             self.progress(self.count)
 
-    def said_of_itself(self, summaries: dict[str, dict[str, Any]]) -> Records:
+    def said_of_itself(self, summaries: dict[str, dict[str, Any]]) -> dict[str, dict[str, str]]:
         """Return what the new bag says of its completeness and of its recovery."""
         before = self.records.get(COMPLETENESS, {})
         return {

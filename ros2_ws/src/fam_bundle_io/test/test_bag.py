@@ -284,29 +284,83 @@ def test_only_what_begins_with_header_and_tick_carries_one() -> None:
     assert not completeness.carries_tick('uint64 tick\nstd_msgs/Header header\n')
 
 
-def ledger_of(ticks: list[int], sequences: list[int] | None = None) -> dict[str, Any]:
-    types, ledger = store(), completeness.TopicLedger(ticks=True)
+def ledger_of(
+    ticks: list[int], sequences: list[int] | None = None, *, answers: bool = False
+) -> dict[str, Any]:
+    types, ledger = store(), completeness.TopicLedger(ticks=True, answers=answers)
     for number, tick in enumerate(ticks):
         sequence = sequences[number] if sequences else number + 1
         ledger.note(sequence, sample(types, tick))
     return ledger.summary()
 
 
+def missing(**summaries: dict[str, Any]) -> list[str]:
+    named = {f'/{name}': summary for name, summary in summaries.items()}
+    return list(completeness.shortcomings(named, 0, {}))
+
+
 def test_the_ledger_counts_gaps_repeats_and_runs() -> None:
-    whole = ledger_of([0, 1, 2, 3])
-    assert list(completeness.shortcomings({'/x': whole}, 0)) == []
     gap = ledger_of([0, 1, 4, 5, 7])
     assert (gap['missing_ticks'], gap['gaps']) == (3, [(2, 3), (6, 6)])
+    assert missing(x=gap) == ['/x: 3 ticks without a message (2-3, 6)']
+    assert json.dumps(gap)
     assert ledger_of([0, 1, 1, 0, 1])['runs'] == 2
     assert ledger_of([0, 1, 1, 2])['repeated_ticks'] == 1
     assert ledger_of([0, 1, 2], [1, 2, 5])['lost'] == 2
     assert ledger_of([0, 1, 2], [8, 9, 1])['lost'] == 0
-    early = list(completeness.shortcomings({'/x': whole, '/y': ledger_of([0, 1])}, 0))
-    assert early == ['/y: ends with tick 1, the others with 3']
-    late = list(completeness.shortcomings({'/x': whole, '/y': ledger_of([2, 3])}, 0))
-    assert late == ['/y: begins with tick 2, the others with 0']
-    assert not list(completeness.shortcomings({'/a/x': whole, '/b/x': ledger_of([0, 1])}, 0))
-    words = list(completeness.shortcomings({'/x': gap}, 4))
-    assert words[0].startswith('4 messages dropped')
-    assert words[1] == '/x: 3 ticks without a message (2-3, 6)'
-    assert json.dumps(gap)
+
+
+def test_a_record_that_begins_late_or_ends_early_is_not_whole() -> None:
+    whole, early = ledger_of([0, 1, 2, 3]), ledger_of([0, 1])
+    assert missing(x=whole) == []
+    assert missing(x=whole, y=early) == ['/y: ends with tick 1, the others with 3']
+    assert missing(x=whole, y=ledger_of([2, 3])) == ['/y: begins with tick 2']
+    late = ledger_of([500, 501])
+    assert missing(x=late, y=late) == ['/x: begins with tick 500', '/y: begins with tick 500']
+    bundles = {'/a/x': whole, '/b/x': early}
+    assert not list(completeness.shortcomings(bundles, 0, {}))
+
+
+def test_what_was_dropped_or_never_recorded_is_missing() -> None:
+    whole = {'/x': ledger_of([0, 1, 2])}
+    assert json.loads(completeness.record_of(whole, 0, {})['whole']) is True
+    (words,) = completeness.shortcomings(whole, 4, {})
+    assert words.startswith('4 messages dropped')
+    skipped = completeness.record_of(whole, 0, {'/y': 'not recorded: no type'})
+    assert json.loads(skipped['whole']) is False
+    assert json.loads(skipped['missing']) == ['/y: not recorded: no type']
+    for nothing in ({}, {'/x': ledger_of([])}):
+        record = completeness.record_of(nothing, 0, {})
+        assert json.loads(record['whole']) is False
+        assert json.loads(record['missing']) == ['no message was recorded']
+
+
+def test_a_sample_that_nobody_answered_is_not_missing() -> None:
+    ticks = [2, 3, 6, 7, 9, 11, 13]
+    summary = ledger_of(ticks, answers=True)
+    assert summary['first_tick'] == 2
+    record = completeness.record_of({'/valve_command': summary}, 0, {})
+    assert json.loads(record['whole']) is True
+    assert json.loads(record['unanswered']) == [
+        '/valve_command: 7 samples were not answered (0-1, 4-5, 8, ...)'
+    ]
+
+
+def test_without_proof_a_missing_answer_is_missing() -> None:
+    """Sequence numbers are unknown, begin anew, or tell of a loss; or the plant itself skips."""
+    ticks = [0, 1, 4]
+    for sequences in ([0, 0, 0], [1, 2, 0], [0, 0, 1], [7, 8, 1], [1, 2, 4]):
+        summary = ledger_of(ticks, sequences, answers=True)
+        assert (summary['missing_ticks'], summary['unanswered']) == (2, 0)
+        assert '/x: 2 ticks without a message (2-3)' in missing(x=summary)
+    assert missing(x=ledger_of([3, 4], [9, 10], answers=True)) == ['/x: begins with tick 3']
+    assert missing(x=ledger_of([3, 4], [0, 0], answers=True)) == ['/x: begins with tick 3']
+    assert completeness.is_answer('/left/valve_command')
+    assert not completeness.is_answer('/left/bundle_state')
+
+
+def test_thousands_of_gaps_are_said_in_a_line() -> None:
+    for answers in (False, True):
+        summaries = {'/valve_command': ledger_of(list(range(0, 4000, 2)), answers=answers)}
+        record = completeness.record_of(summaries, 0, {})
+        assert len(record['missing'] + record['unanswered']) < 200
