@@ -35,6 +35,7 @@ QUIET = 0.3  # s without a disturbance before a fault
 DISTURBED = 0.5  # of the time in which a command is stale: no sample, the machine was elsewhere
 PATIENCE = 40.0  # s for the loop to be quiet
 SOFTER = 0.1  # gains: with the paper's a loop on a late machine is unstable
+MATCHED = 0.2  # s after which a service has found its client too; an earlier call waits for that
 ANSWER_SHARE = 0.5  # calls of the card take a tenth of a period here, through a socket
 PRIORITY = 10  # of all processes, as on a rig; without the right rows are repeated more often
 STEP = 4e-4  # V; a converter of 16 bits over 20 V has steps of 0.3 mV
@@ -101,6 +102,7 @@ class BridgeRig(Rig):
         )
         super().__init__(used, folder)
         self.card_log = folder / 'card.log'
+        self._clients: dict[str, Any] = {}
         self.may_end: set[str] = set()  # nodes whose end is no surprise
         # Of the stand-in: its law, whether it answers, and what it says first, each once.
         self.command: Command = self.gentle
@@ -148,6 +150,8 @@ class BridgeRig(Rig):
 
     def start_bridge(self, *faulty: str) -> None:
         """Start the bridge; ``faulty`` as ``faulty_bridge`` takes it."""
+        for name in list(self._clients):  # of the bridge before
+            self.node.destroy_client(self._clients.pop(name))
         module = (sys.executable, '-m', 'fam_bundle_bringup.faulty_bridge', *faulty)
         self.start(BRIDGE[1], prefix=module if faulty else ())
         self.wait_for(lambda: self.state() in ('inactive', 'fault'), 'a configured bridge')
@@ -215,15 +219,14 @@ class BridgeRig(Rig):
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
         """Call a service of the bridge and return its answer."""
-        client = self.node.create_client(kind, f'{BRIDGE[1]}/{name}')
-        try:
-            self.wait_for(client.service_is_ready, name)
-            self.called_at = time.monotonic_ns()  # the middleware may take long to find a service
-            future = client.call_async(request)
-            self.wait_for(future.done, f'the answer of {name}')
-            return future.result()
-        finally:
-            self.node.destroy_client(client)
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, f'{BRIDGE[1]}/{name}')
+            self.wait_for(self._clients[name].service_is_ready, name)
+            self.listen(MATCHED)
+        self.called_at = time.monotonic_ns()
+        future = self._clients[name].call_async(request)
+        self.wait_for(future.done, f'the answer of {name}')
+        return future.result()
 
     def trigger(self, name: str) -> tuple[bool, str]:
         """Call a service that takes nothing; return success and message."""
