@@ -5,15 +5,24 @@ import json
 import os
 import signal
 import subprocess
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import UInt64
 
 from fam_bundle_bringup.graph import own_domain, run_graph
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_bringup.processes import executable
 from fam_bundle_io.bag import read_bag, trace_of
+from fam_bundle_io.bag_recorder_node import BagRecorder
 from fam_bundle_model.parameters import Configuration
 
 LOOP = ('/bundle_state', '/pressure_reference', '/recruitment_state', '/valve_command')
@@ -34,6 +43,7 @@ def test_a_recorded_run_gives_its_trace_to_the_last_bit(
         assert run.trace[name].tobytes() == trace[name].tobytes() == values.tobytes(), name
     completeness = bag.records['fam_bundle.completeness']
     assert json.loads(completeness['whole']) is True
+    assert json.loads(completeness['unanswered']) == []
     for topic in LOOP:
         summary = json.loads(completeness[topic])
         assert summary['count'] == configuration.ticks()
@@ -56,25 +66,104 @@ def recorder(*options: str) -> subprocess.Popen[str]:
     [
         ((), "bag.folder = '': must name a folder"),
         (('bag.folder:=/proc/no/bag',), '/proc/no/bag: '),
-        (('bag.folder:=x', 'bag.split_size:=-1'), 'bag.split_size = -1: must be >= 0'),
+        (('bag.folder:=X', 'bag.split_size:=-1'), 'bag.split_size = -1: must be >= 0'),
+        (('bag.folder:=X', 'bag.split_size:=1.5'), 'bag.split_size = 1.5: must be a whole'),
+        (('bag.folder:=X', 'bag.split_duration:=-2'), 'bag.split_duration = -2: must be >= 0'),
+        (('bag.folder:=X', 'bag.split_duration:=.nan'), 'bag.split_duration = nan: must be'),
+        (('bag.folder:=X', 'bag.split_duration:=much'), 'bag.split_duration = much: must be'),
+        (('bag.folder:=X', 'bag.topics:=[]'), 'bag.topics = []: must name at least one topic'),
+        (('bag.folder:=X', 'bag.topics:=talk'), 'bag.topics = talk: must'),
+        (('bag.folder:=7',), 'bag.folder = 7: must be text'),
     ],
 )
-def test_the_recorder_refuses_in_one_line(options: tuple[str, ...], words: str) -> None:
+def test_the_recorder_refuses_in_one_line(
+    options: tuple[str, ...], words: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / 'bag'
     with own_domain():
-        process = recorder(*options)
+        process = recorder(*(option.replace('=X', f'={folder}') for option in options))
         _, err = process.communicate(timeout=60)
     assert process.returncode == 2
     assert err.startswith(f'bag_recorder: {words}')
     assert err.count('\n') == 1
+    assert err.count('bag.split_duration') <= 1
+    assert not folder.exists()
 
 
 def test_a_recorder_of_nothing_ends_well_when_told(tmp_path: Path) -> None:
     with own_domain():
-        process = recorder(f'bag.folder:={tmp_path / "bag"}')
+        process = recorder(f'bag.folder:={tmp_path / "bag"}', 'bag.split_duration:=60')
         while not (tmp_path / 'bag').exists():
             assert process.poll() is None
         process.send_signal(signal.SIGTERM)
         _, err = process.communicate(timeout=60)
     assert process.returncode == 0, err
     assert 'Traceback' not in err
+    assert 'bag_recorder: no message was recorded\n' in err
     assert (tmp_path / 'bag' / 'metadata.yaml').exists()
+
+
+# ---- Publishers of several qualities ----
+
+
+@pytest.fixture
+def source() -> Iterator[Node]:
+    with own_domain():
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        node = rclpy.create_node('source')
+        yield node
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+@pytest.mark.parametrize(
+    'second',
+    [
+        QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT),
+        QoSProfile(depth=10),
+    ],
+)
+def test_a_publisher_of_lower_quality_that_comes_later_is_recorded_too(
+    second: QoSProfile, source: Node, tmp_path: Path
+) -> None:
+    first = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    one = source.create_publisher(UInt64, '/talk', first)
+    one.publish(UInt64(data=0))
+    bag = f'{tmp_path / "bag"}'
+    recorder = BagRecorder(parameter_overrides=[Parameter('bag.folder', value=bag)])
+    executor = SingleThreadedExecutor()
+    executor.add_node(recorder)
+
+    def listen(until: Callable[[], bool]) -> None:
+        end = time.monotonic() + 20.0
+        while not until():
+            assert time.monotonic() < end
+            executor.spin_once(timeout_sec=0.01)
+            recorder.take_all()
+
+    def recorded() -> int:
+        return int(recorder.summaries().get('/talk', {}).get('count', 0))
+
+    listen(lambda: recorded() == 1)
+    other = source.create_publisher(UInt64, '/talk', second)
+    sent = 1
+    end = time.monotonic() + 20.0
+    while other.get_subscription_count() == 0:
+        assert time.monotonic() < end
+        one.publish(UInt64(data=sent))  # while the recorder subscribes anew
+        sent += 1
+        executor.spin_once(timeout_sec=0.01)
+        recorder.take_all()
+    for number in range(5):
+        one.publish(UInt64(data=sent + number))
+        other.publish(UInt64(data=1000 + number))
+    sent += 5
+    listen(lambda: recorded() == sent + 5)
+    for _ in range(20):  # so that what comes twice is there
+        executor.spin_once(timeout_sec=0.01)
+        recorder.take_all()
+    executor.shutdown()
+    assert recorder.close() == []
+    recorder.destroy_node()
+    found = read_bag(tmp_path / 'bag').tables['/talk']['data'].tolist()
+    assert sorted(found) == [*range(sent), *range(1000, 1005)]

@@ -6,6 +6,7 @@ import fnmatch
 import importlib
 import importlib.metadata
 import json
+import math
 import platform
 import resource
 import signal
@@ -20,14 +21,15 @@ import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
+    QoSCompatibility,
     QoSProfile,
     ReliabilityPolicy,
+    qos_check_compatible,
 )
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
@@ -57,6 +59,12 @@ DEPTH = 10_000  # messages of a topic that may wait for this node
 # The plant waits for its listeners, so this node becomes one when it has the others.
 STARTS_THE_RUN = 'bundle_state'
 NOBODYS = ('/rosout', '/parameter_events')  # recorded only where they are named
+ANY_QUALITY = QoSProfile(  # every offer satisfies it
+    history=HistoryPolicy.KEEP_LAST,
+    depth=DEPTH,
+    reliability=ReliabilityPolicy.BEST_EFFORT,
+    durability=DurabilityPolicy.VOLATILE,
+)
 PARAMETERS = {
     'folder': ('', 'folder of the bag; must not exist'),
     'topics': (['*', '/diagnostics'], 'topics or patterns, relative to the namespace or absolute'),
@@ -83,16 +91,20 @@ class Polled(CallbackGroup):
 class BagRecorder(Node):
     """Takes messages as bytes, and knows their types only to name them."""
 
-    def __init__(self) -> None:
-        """Open the bag; raises ConfigurationError for a bad parameter, BagError for a bad bag."""
-        super().__init__('bag_recorder')
+    def __init__(self, **options: Any) -> None:
+        """Open the bag; raises ConfigurationError for a bad parameter, BagError for a bad bag.
+
+        ``options`` are those of a node.
+        """
+        super().__init__('bag_recorder', **options)
         try:
             given = self._declare()
             self.configuration = self._configuration()
             self._ledgers: dict[str, TopicLedger] = {}
             self.skipped: dict[str, str] = {}
             self._waits: dict[str, str] = {}
-            self._taps: dict[str, Subscription] = {}
+            self._taps: dict[str, list[Subscription]] = {}
+            self._seen: dict[str, dict[tuple[int, int], None]] = {}
             self._polled = Polled()
             self.writer = BagWriter(
                 Path(given['folder']),
@@ -112,16 +124,12 @@ class BagRecorder(Node):
     def _declare(self) -> dict[str, Any]:
         given: dict[str, Any] = {}
         for name, (default, text) in PARAMETERS.items():
-            descriptor = ParameterDescriptor(description=text, read_only=True)
-            try:
-                given[name] = self.declare_parameter(f'bag.{name}', default, descriptor).value
-            except InvalidParameterTypeException as error:
-                raise ConfigurationError(f'bag.{name}: {error}') from None
+            # Dynamic, so that 60 serves where a float is wanted.
+            descriptor = ParameterDescriptor(description=text, read_only=True, dynamic_typing=True)
+            value = self.declare_parameter(f'bag.{name}', default, descriptor).value
+            given[name] = checked(f'bag.{name}', value, type(default))
         if not given['folder']:
             raise ConfigurationError("bag.folder = '': must name a folder that does not exist")
-        for name in ('split_size', 'split_duration'):
-            if not given[name] >= 0:
-                raise ConfigurationError(f'bag.{name} = {given[name]}: must be >= 0')
         return given
 
     def _configuration(self) -> Configuration | None:
@@ -132,7 +140,12 @@ class BagRecorder(Node):
     # ---- What to record ----
 
     def look_for_topics(self) -> None:
-        """Subscribe to what is new and wanted; to the plant when the rest of the loop is there."""
+        """Subscribe to what is new and wanted; to the plant when the rest of the loop is there.
+
+        Also look whether what is recorded has publishers of a lower quality now.
+        """
+        for name, taps in self._taps.items():
+            self._satisfy_all(name, taps)
         found = dict(self.get_topic_names_and_types())
         wanted = [name for name in sorted(found) if self.is_wanted(name) and self.is_offered(name)]
         wanted.sort(key=lambda name: name.endswith(STARTS_THE_RUN))
@@ -182,14 +195,29 @@ class BagRecorder(Node):
         )
         self._ledgers[name] = TopicLedger(ticks=carries_tick(definition), answers=is_answer(name))
         self.writer.add_topic(topic)
-        self._taps[name] = self.create_subscription(
+        self._taps[name] = [self._tap(name, python_type, quality_for(offered))]
+
+    def _tap(self, name: str, python_type: Any, quality: QoSProfile) -> Subscription:
+        return self.create_subscription(
             python_type,
             name,
             lambda message: None,
-            quality_for(offered),
+            quality,
             callback_group=self._polled,
             raw=True,
         )
+
+    def _satisfy_all(self, name: str, taps: list[Subscription]) -> None:
+        """Subscribe a second time, to every quality, where the first one misses a publisher.
+
+        The first one stays, so that nothing is lost between; what comes twice is written once.
+        """
+        offered = self.get_publishers_info_by_topic(name)
+        if all(any(satisfies(offer, tap) for tap in taps) for offer in offered):
+            return
+        self._seen[name] = {}
+        taps.append(self._tap(name, taps[0].msg_type, ANY_QUALITY))
+        self.get_logger().warning(f'{name}: a publisher of lower quality came, and is recorded')
 
     def _skip(self, name: str, why: str) -> None:
         self.skipped[name] = why
@@ -198,21 +226,25 @@ class BagRecorder(Node):
     def take_all(self) -> bool:
         """Take what has come on all topics, and return whether anything has."""
         before = self.writer.taken
-        for name, tap in self._taps.items():
-            handle = tap.handle
-            with handle:
-                while (taken := handle.take_message(tap.msg_type, True)) is not None:
-                    data, info = taken
-                    self.writer.write(
-                        Item(
-                            name,
-                            info['received_timestamp'] or time.time_ns(),
-                            info['source_timestamp'],
-                            info['publication_sequence_number'] or 0,
-                            data,
-                        )
-                    )
+        for name, taps in self._taps.items():
+            for tap in taps:
+                self._take(name, tap)
         return self.writer.taken > before
+
+    def _take(self, name: str, tap: Subscription) -> None:
+        seen, handle = self._seen.get(name), tap.handle
+        with handle:
+            while (taken := handle.take_message(tap.msg_type, True)) is not None:
+                data, info = taken
+                item = Item(
+                    name,
+                    info['received_timestamp'] or time.time_ns(),
+                    info['source_timestamp'],
+                    info['publication_sequence_number'] or 0,
+                    data,
+                )
+                if seen is None or is_new(item, seen):
+                    self.writer.write(item)
 
     def is_behind(self) -> bool:
         """Return whether some topic of the loop has come to an earlier tick than another.
@@ -255,6 +287,25 @@ class BagRecorder(Node):
         }
 
 
+def checked(name: str, value: Any, kind: type) -> Any:
+    """Return the value of a parameter as a ``kind``; raises ConfigurationError in one line."""
+    if kind is list:
+        if not isinstance(value, list) or not value or not all(isinstance(v, str) for v in value):
+            # ROS gives None for an empty list.
+            raise ConfigurationError(f'{name} = {value or []}: must name at least one topic')
+    elif kind is str:
+        if not isinstance(value, str):
+            raise ConfigurationError(f'{name} = {value}: must be text')
+    else:
+        numbers = (int, float) if kind is float else (int,)
+        if isinstance(value, bool) or not isinstance(value, numbers):
+            words = 'a number' if kind is float else 'a whole number'
+            raise ConfigurationError(f'{name} = {value}: must be {words}')
+        if not 0 <= value < math.inf:
+            raise ConfigurationError(f'{name} = {value}: must be >= 0 and finite')
+    return value
+
+
 def provenance(configuration: Configuration | None) -> dict[str, str]:
     """Return what shaped a run: its parameters, where they are known, and versions."""
     versions = {
@@ -282,6 +333,22 @@ def provenance(configuration: Configuration | None) -> dict[str, str]:
             ),
         }
     return found
+
+
+def is_new(item: Item, seen: dict[tuple[int, int], None]) -> bool:
+    """Return whether a message is not among the newest ``seen``, and note it there."""
+    key = item.published, item.sequence
+    new = key not in seen
+    seen[key] = None
+    if len(seen) > DEPTH:
+        del seen[next(iter(seen))]
+    return new
+
+
+def satisfies(offer: TopicEndpointInfo, tap: Subscription) -> bool:
+    """Return whether a subscription gets what is published with the offered quality."""
+    compatible, _ = qos_check_compatible(offer.qos_profile, tap.qos_profile)
+    return bool(compatible != QoSCompatibility.ERROR)
 
 
 def quality_for(offered: list[TopicEndpointInfo]) -> QoSProfile:
