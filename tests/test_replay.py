@@ -29,7 +29,8 @@ from fam_bundle_bringup.processes import executable
 from fam_bundle_bringup.replay import run_replay
 from fam_bundle_bringup.replay_controllers import Samples, Stamp, same_bits, samples_of
 from fam_bundle_bringup.replay_plant import measured, measured_state, strain_rate
-from fam_bundle_io.bag import one_run, read_bag
+from fam_bundle_io.bag import LOOP as NAMES
+from fam_bundle_io.bag import read_bag, run_tables
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_io.completeness import tick_of
 from fam_bundle_model.parameters import (
@@ -71,6 +72,11 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
 @pytest.fixture(scope='module')
 def bag(recorded: Recorded) -> Path:
     return recorded('lag_pressure')
+
+
+def run_in(bag: Path) -> dict[str, Any]:
+    """Return the rows of the run in ``bag`` by tick, for each topic of the loop."""
+    return {NAMES[name]: table for name, table in run_tables(read_bag(bag))[0].items()}
 
 
 def edited(
@@ -159,7 +165,7 @@ def test_controllers_and_plant_repeat_a_run_to_the_last_bit(
     assert set(found.tops('from_the_start').values()) == {0.0}
     # All of the state but the strain rate is measured; without any rate this would be ten times
     # as much.
-    samples = measured(samples_of(one_run(read_bag(recorded(scheme)).tables['/bundle_state'], -1)))
+    samples = measured(samples_of(run_in(recorded(scheme))['bundle_state']))
     for name, largest in found.tops('set_anew').items():
         assert 0.0 < largest < 0.005 * np.ptp(samples[name]), name
 
@@ -193,7 +199,7 @@ def test_a_changed_gain_is_found_where_it_begins_to_act(
         ('pressure_reference', 'pressure_unlimited'),
     }
     # The integral share of an error acts one tick later.
-    error = one_run(read_bag(bag).tables['/pressure_reference'], -1)['strain_error']
+    error = run_in(bag)['pressure_reference']['strain_error']
     first = int(np.flatnonzero(error)[0]) + 1
     words = f'not equal: pressure_reference pressure differs first at tick {first}: '
     assert words in capsys.readouterr().out
@@ -227,7 +233,7 @@ def test_commands_that_were_not_recorded_are_counted(bag: Path, tmp_path: Path) 
 def test_one_bit_of_one_command_is_found(
     bag: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    commands = one_run(read_bag(bag).tables['/valve_command'], -1)
+    commands = run_in(bag)['valve_command']
     was = float(commands['spool[1]'][1234])
     one, other = (struct.pack('<d', value) for value in (was, np.nextafter(was, 2.0)))
 

@@ -411,10 +411,3 @@ def _answers(
     )
     places = answers.index[(nearest['run'] == wanted).to_numpy()]
     return table.loc[places.sort_values()]
-
-
-def one_run(table: 'pd.DataFrame', run: int) -> 'pd.DataFrame':
-    """Return the rows of one run by tick, each at its first coming."""
-    runs = runs_of(table)
-    rows = table[runs == (run if run >= 0 else runs[-1] + 1 + run)]
-    return rows.drop_duplicates('tick').set_index('tick')

@@ -303,7 +303,10 @@ class _Walk:
         if opcode not in DATA and opcode < PRIVATE:
             raise _Broken(f'opcode {opcode}')
         if length > self.size - self.at:
-            raise _Broken(f'a record of {length} bytes, {self.size - self.at} are left')
+            left = self.size - self.at
+            if left < 0:
+                raise _Broken('it was still being written')
+            raise _Broken(f'the file ends within a record: {left} of its {length} bytes are there')
         if opcode == Opcode.DATA_END:
             if length != 4:
                 raise _Broken(f'an end of {length} bytes')

@@ -19,6 +19,8 @@ from mcap.reader import make_reader
 
 from fam_bundle_io import cdr
 from fam_bundle_io.bag import Bag, Run, read_bag, trace_of
+from fam_bundle_io.bag_mcap import read_mcap
+from fam_bundle_io.bag_parts import Damage
 from fam_bundle_io.bag_writer import BagError, Item, Topic
 from fam_bundle_io.completeness import tick_of
 
@@ -232,6 +234,32 @@ def test_a_file_that_ends_too_early_says_where(whole: Make, tmp_path: Path) -> N
     bag = read_bag(file)
     count = sum(len(table) for table in bag.tables.values())
     assert any(f'cut short after {count} messages' in words for words in bag.warnings)
+
+
+def test_a_file_that_ends_within_a_record_says_how_much_is_there(
+    whole: Make, tmp_path: Path
+) -> None:
+    file = file_of(whole, 'ours', tmp_path)
+    (begin, end), *_ = chunks(file)[3:]
+    file.write_bytes(file.read_bytes()[: begin + 9 + 100])
+    words = f'the file ends within a record: 100 of its {end - begin - 9} bytes are there'
+    assert any(words in warning for warning in read_bag(file).warnings)
+
+
+def test_a_file_that_grows_while_it_is_read_is_still_being_written(
+    whole: Make, tmp_path: Path
+) -> None:
+    file = file_of(whole, 'ours', tmp_path)
+    content = file.read_bytes()
+    (begin, _), *_ = chunks(file)[3:]
+    file.write_bytes(content[: begin + 5])  # within the head of a record
+    parts = read_mcap(file, 0)
+    found = [next(parts)]
+    with file.open('ab') as stream:
+        stream.write(content[begin + 5 :])
+    found += parts
+    (damage,) = [part.words for part in found if isinstance(part, Damage)]
+    assert damage.endswith(' messages: it was still being written')
 
 
 def test_rows_that_an_index_of_a_database_has_and_its_table_not(
