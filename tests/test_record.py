@@ -18,6 +18,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import UInt64
 
+from fam_bundle_bringup.cli import recorded_lines
 from fam_bundle_bringup.graph import own_domain, run_graph
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_bringup.processes import executable
@@ -101,6 +102,18 @@ def test_a_recorder_of_nothing_ends_well_when_told(tmp_path: Path) -> None:
     assert 'Traceback' not in err
     assert 'bag_recorder: no message was recorded\n' in err
     assert (tmp_path / 'bag' / 'metadata.yaml').exists()
+
+
+def test_a_run_is_said_to_be_whole_though_samples_were_not_answered() -> None:
+    bag = {'messages': 9, 'missing': [], 'unanswered': {}, 'cpu_share': 0.1, 'peak_memory': 9e7}
+    cost = f'{"":16}recorder: 0.10 of a core, 90 MB'
+    assert recorded_lines(bag) == ['  recorded      9 messages, whole;', cost]
+    bag['unanswered'] = {'/pressure_reference': 12, '/recruitment_state': 0, '/valve_command': 3}
+    words = 'samples not answered: 12 of pressure_reference, 3 of valve_command;'
+    assert recorded_lines(bag)[1:] == [f'{"":16}{words}', cost]
+    bag['missing'] = [f'/x{number}: gone' for number in range(5)]
+    words = '/x0: gone; /x1: gone; /x2: gone; and 2 more, see metadata.yaml;'
+    assert recorded_lines(bag)[0] == f'  recorded      9 messages, {words}'
 
 
 # ---- Publishers of several qualities ----

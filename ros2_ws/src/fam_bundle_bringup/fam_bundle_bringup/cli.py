@@ -28,6 +28,8 @@ from fam_bundle_bringup.rig_commands import add_rig_commands, run_rig_command
 from fam_bundle_model.parameters import SCHEMES, Configuration
 from fam_bundle_model.schema import ConfigurationError
 
+NAMED = 3  # of what a bag misses
+
 
 def parser() -> Parser:
     """Return the parser of all commands."""
@@ -207,11 +209,13 @@ def run_experiment_command(options: argparse.Namespace, configuration: Configura
 
 def recorded_lines(bag: Mapping[str, Any]) -> list[str]:
     """Return what is said of the bag of a run: is it whole, and what did recording take."""
-    missing, unanswered = bag['missing'] or ['whole'], sum(bag['unanswered'].values())
+    missing = bag['missing'][:NAMED] or ['whole']
+    if len(bag['missing']) > NAMED:
+        missing.append(f'and {len(bag["missing"]) - NAMED} more, see metadata.yaml')
     lines = [f'{bag["messages"]} messages, {"; ".join(missing)};']
+    unanswered = [f'{n} of {name.lstrip("/")}' for name, n in bag['unanswered'].items() if n]
     if unanswered:
-        per_topic = (f'{count} of {name.lstrip("/")}' for name, count in bag['unanswered'].items())
-        lines.append(f'samples not answered: {", ".join(per_topic)};')
+        lines.append(f'samples not answered: {", ".join(unanswered)};')
     memory = f'{bag["peak_memory"] / 1e6:.0f} MB'
     lines.append(f'recorder: {bag["cpu_share"]:.2f} of a core, {memory}')
     return [f'  {"" if number else "recorded":14}{line}' for number, line in enumerate(lines)]
