@@ -451,4 +451,4 @@ def test_a_run_in_real_time_is_repeated_through_a_safe_state(tmp_path: Path) -> 
     for topic in LOOP[1:]:
         compared = {c['compared'] for c in found.signals.values() if c['topic'] == topic}
         assert compared == {len(tables[f'/{topic}'])}
-    assert len(tables['/pressure_reference']) < len(tables['/recruitment_state'])
+    assert len(tables['/pressure_reference']) < len(tables['/bundle_state'])
