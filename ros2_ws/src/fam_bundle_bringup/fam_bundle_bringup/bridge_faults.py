@@ -616,6 +616,7 @@ def of_operation() -> Iterator[Fault]:
         cleanup_in_order,
     )
     yield alone('lifecycle: shutdown', f'{prompt}; the process ends with status 0', shut_down)
+    yield alone('~/reset_fault while active', f'refused; {RUNS_ON}', reset_while_active)
     yield alone(
         '~/reset_fault while pressurised',
         f'refused, {LIMITS.depressurised * 1e-3:g} kPa named; granted below it; '
@@ -681,6 +682,12 @@ def shut_down(rig: BridgeRig) -> Found:
     rig.change('shutdown')
     since = rig.called_at
     return both(went_safe(rig, since, PROMPT), ended(rig, 0))
+
+
+def reset_while_active(rig: BridgeRig) -> Found:
+    """Ask for a reset where there is no fault."""
+    done, words = rig.trigger('reset_fault')
+    return both((f'"{words}"', not done), goes_on(rig, rig.called_at))
 
 
 def reset_under_pressure(rig: BridgeRig) -> Found:

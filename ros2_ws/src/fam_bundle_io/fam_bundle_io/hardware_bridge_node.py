@@ -339,11 +339,11 @@ class HardwareBridge(LoopNode, LifecycleNodeMixin):
         """End a latched fault. Raises Refused unless every motor unit is depressurised."""
 
         def reset(monitor: Monitor) -> None:
-            self.thread.end()
             if monitor.state is State.FAULT and not monitor.readable:
                 monitor.configure()
                 monitor.tick()
             monitor.reset_fault()
+            self.thread.end()  # not before: a refusal must not end the run of an active bridge
 
         self.thread.ask(reset, CONFIGURE_TIMEOUT)
 

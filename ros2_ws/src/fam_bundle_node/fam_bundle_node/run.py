@@ -2,6 +2,7 @@
 """Runs nodes of the loop in this process until they are done: executor, tuning, exit status."""
 
 import sys
+import time
 from collections.abc import Callable, Sequence
 
 import rclpy
@@ -14,6 +15,7 @@ from fam_bundle_node.loop_node import LoopNode
 from fam_bundle_node.tuning import tune
 
 INTERRUPTED = 130
+SIGNAL_TIME = 0.2  # s between a callback that a signal cuts short and the end of the context
 CUT_SHORT = 'Unable to convert call argument'  # of the events executor
 
 
@@ -65,7 +67,7 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
     except RuntimeError as error:
         # A callback was under way when a signal ended the context: rcl and the executor say so.
         known = isinstance(error, rclpy_implementation.RCLError) or CUT_SHORT in str(error)
-        if rclpy.ok() or not known:
+        if not known or not context_ends():
             raise
     finally:
         for node in nodes:
@@ -73,6 +75,14 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
     status: int = done.result() if done.done() else INTERRUPTED
     rclpy.try_shutdown()
     return status
+
+
+def context_ends() -> bool:
+    """Return whether the context has ended, or does so in a moment: a signal takes one."""
+    end = time.monotonic() + SIGNAL_TIME
+    while rclpy.ok() and time.monotonic() < end:
+        time.sleep(0.001)
+    return not rclpy.ok()
 
 
 def spin(nodes: Sequence[LoopNode], done: Future) -> None:
