@@ -49,7 +49,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     root = tmp_path_factory.mktemp('whole')
     return functools.cache(lambda kind: damage.WHOLE[kind](root / kind))
 
+
 # A third of them: a replay takes longer than reading, which is tried with all.
+
 
 @pytest.mark.parametrize('name', list(damage.CASES)[::3])
 def test_every_damaged_bag(
