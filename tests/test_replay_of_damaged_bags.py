@@ -51,8 +51,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
 
 
 # A third of them: a replay takes longer than reading, which is tried with all.
-
-
 @pytest.mark.parametrize('name', list(damage.CASES)[::3])
 def test_every_damaged_bag(
     name: str,
