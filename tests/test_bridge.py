@@ -3,7 +3,6 @@
 
 import contextlib
 import dataclasses
-import json
 import os
 import signal
 import subprocess
@@ -238,4 +237,4 @@ def test_options_that_do_not_fit_are_refused_in_one_line(
     assert done.returncode == 2
     assert words in done.stderr
     assert done.stderr.count('\n') == 1
-    assert json.dumps(done.stdout) == '""'
+    assert done.stdout == ''
