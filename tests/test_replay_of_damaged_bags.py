@@ -46,8 +46,7 @@ def loud() -> Iterator[None]:
 
 @pytest.fixture(scope='module')
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    root = tmp_path_factory.mktemp('whole')
-    return functools.cache(lambda kind: damage.WHOLE[kind](root / kind))
+    return damage.whole_bags(tmp_path_factory.mktemp('whole'))
 
 
 # A third of them: a replay takes longer than reading, which is tried with all.

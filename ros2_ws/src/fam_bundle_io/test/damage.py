@@ -185,6 +185,17 @@ WHOLE: dict[str, Callable[[Path], Path]] = {
 # ---- Damage ----
 
 
+def whole_bags(root: Path) -> Callable[[str], Path]:
+    """Return a maker of the bags of WHOLE in ``root``, each written once."""
+
+    def make(kind: str) -> Path:
+        if not (root / kind).exists():
+            WHOLE[kind](root / kind)
+        return root / kind
+
+    return make
+
+
 class Case(NamedTuple):
     """One damaged bag: of which whole one, and how.
 

@@ -34,14 +34,7 @@ Make = Callable[[str], Path]
 @pytest.fixture(scope='module')
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Make:
     """Return a maker of whole bags, each written once."""
-    root = tmp_path_factory.mktemp('whole')
-
-    def make(kind: str) -> Path:
-        if not (root / kind).exists():
-            damage.WHOLE[kind](root / kind)
-        return root / kind
-
-    return make
+    return damage.whole_bags(tmp_path_factory.mktemp('whole'))
 
 
 Truth = Callable[[damage.Case], dict[str, pd.DataFrame]]

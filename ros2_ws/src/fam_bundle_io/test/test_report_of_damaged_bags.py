@@ -20,14 +20,7 @@ PAGES = 20  # the first of so many cases is drawn too, which takes longer
 
 @pytest.fixture(scope='module')
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    root = tmp_path_factory.mktemp('whole')
-
-    def make(kind: str) -> Path:
-        if not (root / kind).exists():
-            damage.WHOLE[kind](root / kind)
-        return root / kind
-
-    return make
+    return damage.whole_bags(tmp_path_factory.mktemp('whole'))
 
 
 @pytest.fixture(scope='module')
