@@ -19,7 +19,6 @@ from fam_bundle_control.recruitment import (
     recruitment_start,
     recruitment_step,
 )
-from fam_bundle_control.reference import strain_reference
 from fam_bundle_control.strain_loop import (
     StrainLoop,
     StrainLoopState,
@@ -32,6 +31,7 @@ from fam_bundle_model.compile import compiled
 from fam_bundle_model.lag_table import LagTable, cached_lag_table
 from fam_bundle_model.parameters import Configuration, seconds
 from fam_bundle_model.pressure_pi import PressureGains, pressure_gains
+from fam_bundle_model.reference import Reference, reference_law, strain_reference
 from fam_bundle_sim.plant import Plant, plant, plant_step, resting_state, truth
 from fam_bundle_sim.sensors import Sensors, measure, noise_samples, sensors
 
@@ -52,27 +52,30 @@ def run_block(
     inner: PressureGains,
     policy: Recruitment,
     table: LagTable,
+    trajectory: Reference,
     period: float,
     substeps: int,
     plant_state: npt.NDArray[np.float64],
     integral: npt.NDArray[np.float64],
     outer_state: StrainLoopState,
     policy_state: RecruitmentState,
+    times: npt.NDArray[np.float64],
     references: npt.NDArray[np.float64],
     noise: npt.NDArray[np.float64],
     rows: npt.NDArray[np.float64],
     mu_pressures: npt.NDArray[np.float64],
     spools: npt.NDArray[np.float64],
 ) -> tuple[StrainLoopState, RecruitmentState]:
-    """Run one tick for each of ``references`` and fill the rows of the trace.
+    """Run one tick for each of ``times`` and fill ``references`` and the rows of the trace.
 
     ``plant_state`` and ``integral`` are advanced in place, the other states returned.
     """
     units = integral.shape[0]
     wanted, saturated = np.empty(units), np.empty(units, dtype=np.bool_)
-    for k in range(references.shape[0]):
+    for k in range(times.shape[0]):
         pressure, spool, row = mu_pressures[k], spools[k], rows[k]
         seen = measure(instruments, truth(rig, plant_state, pressure), noise[k], pressure)
+        references[k] = strain_reference(trajectory, times[k])
         outer_state, asked = strain_loop_step(
             outer,
             outer_state,
@@ -86,7 +89,9 @@ def run_block(
             policy,
             rig.units,
             table,
+            trajectory,
             policy_state,
+            times[k],
             seen.strain,
             seen.force,
             seen.source_pressure,
@@ -162,14 +167,13 @@ def run_offline(
         pressure_gains(configuration.pressure_loop),
         recruitment(configuration),
         cached_lag_table(configuration) if table is None else table,
+        reference_law(configuration.reference),
     )
     for first in range(0, ticks, BLOCK):
         block = slice(first, min(first + BLOCK, ticks))
         times = [seconds(k * step) for k in range(block.start, block.stop)]
-        references = [strain_reference(configuration.reference, t) for t in times]
         rows = np.empty((len(times), len(COLUMNS)))
         trace['time'][block] = times
-        trace['strain_reference'][block] = references
         outer_state, policy_state = run_block(
             *laws,
             seconds(step),
@@ -178,6 +182,7 @@ def run_offline(
             integral,
             outer_state,
             policy_state,
+            trace['time'][block],
             trace['strain_reference'][block],
             np.array(list(itertools.islice(samples, len(times)))),
             rows,

@@ -22,7 +22,6 @@ from fam_bundle_control.recruitment import (
     recruitment_start,
     recruitment_step,
 )
-from fam_bundle_control.reference import strain_reference
 from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_model.bundle import motor_units
@@ -31,6 +30,7 @@ from fam_bundle_model.hydraulics import TO_TANK
 from fam_bundle_model.lag_table import LagTable
 from fam_bundle_model.parameters import Configuration, seconds
 from fam_bundle_model.pressure_pi import pressure_gains
+from fam_bundle_model.reference import reference_law, strain_reference
 from fam_bundle_node.stamps import StampClock, begins_anew, nanoseconds
 from fam_bundle_node.ticks import TickError
 
@@ -189,12 +189,13 @@ def strain_answers(
 ) -> Columns:
     """Return what the strain controller answers: its message's fields, one entry for each step."""
     law, state = strain_loop(configuration), strain_loop_start()
+    trajectory = reference_law(configuration.reference)
     step = direct(strain_loop_step, law, state, 0.0, 0.0, 0.0, 0.0, 1.0)
     first_unit = samples.mu_pressure[:, 0].tolist()
     rows = []
     for row, dt, anew, _ in zip(*steps, strict=True):
         time = seconds(nanoseconds(samples.stamp[row]))
-        reference = strain_reference(configuration.reference, time)
+        reference = strain_reference(trajectory, time)
         state, output = step(
             law,
             strain_loop_start() if anew else state,
@@ -219,16 +220,19 @@ def supervisor_answers(
 ) -> Columns:
     """Return what the recruitment supervisor answers with the lag table ``table``."""
     law, units = recruitment(configuration), motor_units(configuration)
-    memory = recruitment_start()
+    memory, trajectory = recruitment_start(), reference_law(configuration.reference)
     none = np.zeros(len(units))
-    decide = direct(recruitment_step, law, units, table, memory, 0.0, 0.0, 0.0, none, 1.0)
+    model = (law, units, table, trajectory, memory)
+    decide = direct(recruitment_step, *model, 0.0, 0.0, 0.0, 0.0, none, 1.0)
     rows = []
     for row, dt, anew, _ in zip(*steps, strict=True):
         memory, output = decide(
             law,
             units,
             table,
+            trajectory,
             recruitment_start() if anew else memory,
+            seconds(nanoseconds(samples.stamp[row])),
             samples.strain[row],
             samples.force[row],
             samples.source_pressure[row],

@@ -14,24 +14,34 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fam_bundle_control.predictors import (
+    Predictor,
+    PredictorState,
+    filtered,
+    predictor,
+    predictor_start,
+    predictor_step,
+    time_to_fall,
+    time_to_rise,
+)
 from fam_bundle_control.pressure_loop import is_compensated
 from fam_bundle_model import fam
 from fam_bundle_model.bundle import MotorUnit, modelled_strain
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.lag_table import LagTable, look_up
 from fam_bundle_model.parameters import Configuration
+from fam_bundle_model.reference import Reference
 
 
 class Recruitment(NamedTuple):
-    """Settings of the recruitment law; pressures in Pa, times in s, rates in 1/s."""
+    """Settings of the recruitment law; pressures in Pa, times in s."""
 
+    predictor: Predictor
     lag_compensation: bool
     pressure_compensation: bool
     upshift_pressure: float
     downshift_pressure: float
-    strain_rate_time_constant: float
     force_time_constant: float
-    minimum_strain_rate: float
     minimum_dwell: float
 
 
@@ -39,8 +49,7 @@ class RecruitmentState(NamedTuple):
     """What the law remembers: units recruited, filters, time in the state, downshift armed."""
 
     recruited: int
-    strain: float
-    strain_rate: float
+    expected: PredictorState
     force: float
     dwell: float
     armed: bool
@@ -65,20 +74,19 @@ def recruitment(configuration: Configuration) -> Recruitment:
     """Return the law of ``configuration``."""
     p, nominal = configuration.recruitment, configuration.source.nominal_pressure
     return Recruitment(
+        predictor=predictor(p),
         lag_compensation=p.scheme in ('lag', 'lag_pressure'),
         pressure_compensation=p.scheme in ('pressure', 'lag_pressure'),
         upshift_pressure=p.upshift_threshold * nominal,
         downshift_pressure=p.downshift_threshold * nominal,
-        strain_rate_time_constant=p.strain_rate_time_constant,
         force_time_constant=p.force_time_constant,
-        minimum_strain_rate=p.minimum_strain_rate,
         minimum_dwell=p.minimum_dwell,
     )
 
 
 def recruitment_start() -> RecruitmentState:
     """Return the state before the first tick, which finds the recruited units by pressure."""
-    return RecruitmentState(1, 0.0, 0.0, 0.0, math.inf, False, False)
+    return RecruitmentState(1, predictor_start(), 0.0, math.inf, False, False)
 
 
 @compiled
@@ -105,21 +113,6 @@ def compensating_pressure(
 
 
 @compiled
-def time_to_reach(target: float, strain: float, rate: float) -> float:
-    """Return the time in s until the expected strain (equation 14) reaches ``target``.
-
-    Negative where it has been passed; equations 15 and 16. ``rate`` must not be zero.
-    """
-    return (target - strain) / rate
-
-
-@compiled
-def filtered(previous: float, value: float, time_constant: float, dt: float) -> float:
-    """Return the next output of a first-order low-pass filter (backward Euler)."""
-    return previous + (value - previous) * dt / (time_constant + dt)
-
-
-@compiled
 def taut_units(
     units: tuple[MotorUnit, ...], mu_pressure: npt.NDArray[np.float64], strain: float
 ) -> int:
@@ -141,7 +134,9 @@ def recruitment_step(
     law: Recruitment,
     units: tuple[MotorUnit, ...],
     table: LagTable,
+    reference: Reference,
     state: RecruitmentState,
+    time: float,
     strain: float,
     force: float,
     source_pressure: float,
@@ -150,15 +145,15 @@ def recruitment_step(
 ) -> tuple[RecruitmentState, RecruitmentOutput]:
     """Return the next state and the output from one tick's measurements; SI units.
 
-    ``mu_pressure`` holds each unit's pressure in recruitment order.
+    ``mu_pressure`` holds each unit's pressure in recruitment order; ``time`` is that of the
+    measurement, for ``reference``.
     """
-    recruited = state.recruited
-    rate, load = 0.0, force
+    recruited, load = state.recruited, force
+    expected = predictor_step(law.predictor, state.expected, strain, dt)
+    rate = expected.strain_rate
     if not state.started:
         recruited = taut_units(units, mu_pressure, strain)
     else:
-        rate = (strain - state.strain) / dt
-        rate = filtered(state.strain_rate, rate, law.strain_rate_time_constant, dt)
         load = filtered(state.force, force, law.force_time_constant, dt)
 
     newest = recruited - 1
@@ -170,17 +165,17 @@ def recruitment_step(
         compensation = 0.0
 
     saturation = desaturation = math.inf
-    if recruited < len(units) and rate > law.minimum_strain_rate:
+    if recruited < len(units) and rate > law.predictor.minimum_strain_rate:
         effective = source_pressure - lag.drop - compensation
         limit = modelled_strain(units, recruited, effective, load)
-        saturation = time_to_reach(limit, strain, rate)
+        saturation = time_to_rise(law.predictor, expected, limit)
     release = lag
-    if recruited > 1 and rate < -law.minimum_strain_rate:
+    if recruited > 1 and rate < -law.predictor.minimum_strain_rate:
         newest_deslack = fam.deslack_pressure(units[newest].fam, strain)
         release = look_up(table, newest, source_pressure, newest_deslack)
         effective = source_pressure - release.drop - compensation
         limit = modelled_strain(units, recruited - 1, effective, load)
-        desaturation = time_to_reach(limit, strain, rate)
+        desaturation = time_to_fall(law.predictor, expected, limit)
 
     armed = state.armed
     if law.lag_compensation:
@@ -210,4 +205,4 @@ def recruitment_step(
         compensation,
         lag.outside,
     )
-    return RecruitmentState(recruited, strain, rate, load, dwell, armed, True), output
+    return RecruitmentState(recruited, expected, load, dwell, armed, True), output

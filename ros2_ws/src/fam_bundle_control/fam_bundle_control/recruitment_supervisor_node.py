@@ -13,12 +13,15 @@ from fam_bundle_control.recruitment import (
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.compile import direct
 from fam_bundle_model.lag_table import PHYSICS, LagTable, lag_table_hash
+from fam_bundle_model.parameters import seconds
+from fam_bundle_model.reference import reference_law
 from fam_bundle_msgs.msg import BundleState, RecruitmentState
 from fam_bundle_msgs.msg import LagTable as LagTableMessage
 from fam_bundle_node.lag_table_message import from_message
 from fam_bundle_node.loop_node import Controller
 from fam_bundle_node.qos import LATCHED
 from fam_bundle_node.run import run_node
+from fam_bundle_node.stamps import nanoseconds
 
 
 class RecruitmentSupervisor(Controller):
@@ -26,9 +29,10 @@ class RecruitmentSupervisor(Controller):
 
     def __init__(self) -> None:
         """Wait for the table."""
-        super().__init__('recruitment_supervisor', ('recruitment', *PHYSICS))
+        super().__init__('recruitment_supervisor', ('recruitment', 'reference', *PHYSICS))
         self.law = recruitment(self.configuration)
         self.units = motor_units(self.configuration)
+        self.trajectory = reference_law(self.configuration.reference)
         self.table: LagTable | None = None
         self.message = RecruitmentState()
         self.restart()
@@ -55,8 +59,8 @@ class RecruitmentSupervisor(Controller):
             self.fail(f'lag_table: its parts do not fit together ({error})')
             return
         if first:
-            model = (self.law, self.units, self.table, self.memory)
-            measured = (0.0, 0.0, 0.0, np.zeros(len(self.units)), 1.0)
+            model = (self.law, self.units, self.table, self.trajectory, self.memory)
+            measured = (0.0, 0.0, 0.0, 0.0, np.zeros(len(self.units)), 1.0)
             self.decide = direct(recruitment_step, *model, *measured)
             self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state)
 
@@ -67,7 +71,9 @@ class RecruitmentSupervisor(Controller):
             self.law,
             self.units,
             self.table,
+            self.trajectory,
             self.memory,
+            seconds(nanoseconds(seen.header.stamp)),
             seen.strain,
             seen.force,
             seen.source_pressure,

@@ -3,10 +3,10 @@
 
 import sys
 
-from fam_bundle_control.reference import strain_reference
 from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
 from fam_bundle_model.compile import direct
 from fam_bundle_model.parameters import seconds
+from fam_bundle_model.reference import reference_law, strain_reference
 from fam_bundle_msgs.msg import BundleState, PressureReference
 from fam_bundle_node.loop_node import Controller
 from fam_bundle_node.run import run_node
@@ -22,6 +22,7 @@ class StrainController(Controller):
             'strain_controller', ('fam', 'strain_loop', 'source', 'reference', 'simulation')
         )
         self.law = strain_loop(self.configuration)
+        self.trajectory = reference_law(self.configuration.reference)
         self.message = PressureReference()
         self.restart()
         self.publisher = self.loop_publisher(PressureReference, 'pressure_reference')
@@ -36,7 +37,7 @@ class StrainController(Controller):
         """Answer one tick."""
         dt = self.time_step(seen)
         time = seconds(nanoseconds(seen.header.stamp))
-        reference = strain_reference(self.configuration.reference, time)
+        reference = strain_reference(self.trajectory, time)
         self.state_of_law, output = self.step(
             self.law,
             self.state_of_law,

@@ -16,9 +16,11 @@ from fam_bundle_control.recruitment import (
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.lag_table import LagTable
 from fam_bundle_model.parameters import load_configuration
+from fam_bundle_model.reference import Reference
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 DT = 0.001
+STILL = Reference(0.0, 1.0)
 
 
 @pytest.fixture(scope='session')
@@ -42,12 +44,13 @@ def law(configuration):
             'upshift_pressure': 500e3,
             'downshift_pressure': 250e3,
             'minimum_dwell': 0.0,
+            'force_time_constant': 0.03,
             'minimum_strain_rate': 1e-3,
             'strain_rate_time_constant': 0.03,
-            'force_time_constant': 0.03,
             **changes,
         }
-        return made._replace(**values)
+        expected = {name: values.pop(name) for name in made.predictor._fields if name in values}
+        return made._replace(predictor=made.predictor._replace(**expected), **values)
 
     return make
 
@@ -81,7 +84,9 @@ class Supervisor:
                 self.law,
                 self.units,
                 self.table,
+                STILL,
                 self.state,
+                0.0,
                 s['strain'],
                 s['force'],
                 s['source'],

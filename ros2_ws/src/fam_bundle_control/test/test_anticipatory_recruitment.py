@@ -8,10 +8,19 @@ import pytest
 from scipy.optimize import brentq
 from scipy.signal import lfilter
 
-from fam_bundle_control.recruitment import recruitment_start, recruitment_step, time_to_reach
+from fam_bundle_control.predictors import (
+    Predictor,
+    PredictorState,
+    expected_strain,
+    time_to_fall,
+    time_to_rise,
+)
+from fam_bundle_control.recruitment import recruitment_start, recruitment_step
 from fam_bundle_model import fam
+from fam_bundle_model.reference import Reference
 
 DT = 0.001
+STILL = Reference(0.0, 1.0)
 RATE = 0.03  # 1/s
 
 
@@ -66,8 +75,10 @@ def test_time_to_saturation_solves_equation_15(supervise, units, law, constant_t
 def test_expected_strain_is_linear_in_time():
     """Equation 14, at the time of equation 15, is the strain sought."""
     for strain, rate in ((0.05, 0.02), (0.09, -0.01)):
-        t = time_to_reach(0.07, strain, rate)
-        assert rate * t + strain == pytest.approx(0.07)
+        state = PredictorState(strain, rate, True)
+        reach = time_to_rise if rate > 0.0 else time_to_fall
+        t = reach(Predictor(0.03, 1e-3), state, 0.07)
+        assert expected_strain(state, t) == pytest.approx(0.07)
 
 
 def test_the_upshift_comes_exactly_when_the_time_left_is_the_lag(supervise, law, constant_table):
@@ -172,7 +183,17 @@ def test_strain_rate_and_force_filters_are_first_order(units, law, constant_tabl
     state, rates, loads = recruitment_start(), [], []
     for e, f in zip(strain, force, strict=True):
         state, output = recruitment_step(
-            policy, units, constant_table(0.2), state, e, f, 6e5, np.array([4e5, 0.0]), DT
+            policy,
+            units,
+            constant_table(0.2),
+            STILL,
+            state,
+            0.0,
+            e,
+            f,
+            6e5,
+            np.array([4e5, 0.0]),
+            DT,
         )
         rates.append(output.strain_rate)
         loads.append(state.force)

@@ -21,6 +21,7 @@ from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.lag_table import LagTable
 from fam_bundle_model.parameters import load_configuration
 from fam_bundle_model.pressure_pi import pressure_gains
+from fam_bundle_model.reference import Reference
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 
@@ -28,7 +29,7 @@ CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'l
 def evaluate():
     """Return the bits of each tick's outputs, by scheme and law."""
     configuration = load_configuration(CONFIGURATION)
-    units, dt = motor_units(configuration), 1e-3
+    units, dt, still = motor_units(configuration), 1e-3, Reference(0.0, 1.0)
     random = np.random.default_rng(5)
     axis = np.linspace(0.0, 7e5, 6)
     table = LagTable(axis, axis, random.random((2, 6, 6)), 1e5 * random.random((2, 6, 6)))
@@ -49,7 +50,7 @@ def evaluate():
                 outer, outer_state, strain + 1e-3, strain, source, pressures[0], dt
             )
             state, decided = recruitment_step(
-                policy, units, table, state, strain, force, source, pressures, dt
+                policy, units, table, still, state, 0.0, strain, force, source, pressures, dt
             )
             pressure_loop_step(
                 gains,
@@ -64,7 +65,19 @@ def evaluate():
                 spool,
                 saturated,
             )
-            rows.append([*asked, *decided, *state, *integral, *references, *spool, *saturated])
+            rows.append(
+                [
+                    *asked,
+                    *decided,
+                    *state[:1],
+                    *state.expected,
+                    *state[2:],
+                    *integral,
+                    *references,
+                    *spool,
+                    *saturated,
+                ]
+            )
         found[scheme] = [np.array(r, dtype=float).tobytes().hex() for r in rows]
         found[scheme + ' states'] = sorted({r[3] for r in rows})
     return found

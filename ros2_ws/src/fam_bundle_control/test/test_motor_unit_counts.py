@@ -6,12 +6,15 @@ import dataclasses
 import numpy as np
 import pytest
 
+from fam_bundle_control.predictors import PredictorState
 from fam_bundle_control.pressure_loop import pressure_loop_step
 from fam_bundle_control.recruitment import recruitment_start, recruitment_step
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.pressure_pi import PressureGains
+from fam_bundle_model.reference import Reference
 
 DT = 0.001
+STILL = Reference(0.0, 1.0)
 
 
 @pytest.mark.parametrize('count', [1, 2, 3, 16])
@@ -31,7 +34,7 @@ def test_units_are_recruited_in_order_and_released_in_reverse(
         pressures[:recruited] = 6e5 if full else 1e5
         strain = 0.05 + 1e-4 * tick
         state, output = recruitment_step(
-            policy, units, table, state, strain, 180.0, 6.5e5, pressures, DT
+            policy, units, table, STILL, state, 0.0, strain, 180.0, 6.5e5, pressures, DT
         )
         visited.append(output.recruited)
         pressure_loop_step(
@@ -69,7 +72,17 @@ def test_anticipatory_recruitment_stays_within_the_units_there_are(
         strain = 0.06 * (1.0 - np.cos(2.0 * np.pi * tick / 2000.0))
         pressures = np.where(np.arange(count) < state.recruited, 6e5, 0.0)
         state, output = recruitment_step(
-            policy, units, table, state, strain, 60.0 * count**0.5, 6.5e5, pressures, DT
+            policy,
+            units,
+            table,
+            STILL,
+            state,
+            0.0,
+            strain,
+            60.0 * count**0.5,
+            6.5e5,
+            pressures,
+            DT,
         )
         visited.append(output.recruited)
         assert 1 <= output.recruited <= count
@@ -89,12 +102,17 @@ def test_a_middle_state_is_released_although_the_next_unit_could_never_help(
     policy = law('lag')
     pressures = np.array([5e5, 5e5, 0.0])
     state = recruitment_start()._replace(
-        recruited=2, strain=0.14, force=180.0, dwell=9.0, armed=True, started=True
+        recruited=2,
+        expected=PredictorState(0.14, 0.0, True),
+        force=180.0,
+        dwell=9.0,
+        armed=True,
+        started=True,
     )
     for tick in range(4000):
         strain = max(0.14 - 3e-5 * tick, 0.01)
         state, _ = recruitment_step(
-            policy, units, table, state, strain, 180.0, 6.5e5, pressures, DT
+            policy, units, table, STILL, state, 0.0, strain, 180.0, 6.5e5, pressures, DT
         )
         if state.recruited == 1:
             return

@@ -10,7 +10,6 @@ from conftest import CONFIG
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_control.pressure_loop import pressure_loop_step
 from fam_bundle_control.recruitment import recruitment, recruitment_start, recruitment_step
-from fam_bundle_control.reference import strain_reference
 from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
 from fam_bundle_io.hardware.backend import load_backend, make_setup
 from fam_bundle_io.hardware.calibration import load_hardware
@@ -22,6 +21,7 @@ from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.lag_table import cached_lag_table
 from fam_bundle_model.parameters import load_configuration, seconds
 from fam_bundle_model.pressure_pi import pressure_gains
+from fam_bundle_model.reference import reference_law, strain_reference
 
 
 def paper(scheme, **changes):
@@ -66,7 +66,7 @@ def through_volts(configuration, hardware, **options):
     outer, policy, table, inner = laws
     outer_state, policy_state, integral = strain_loop_start(), recruitment_start(), np.zeros(2)
     wanted, spool, saturated = np.empty(2), np.empty(2), np.empty(2, dtype=np.bool_)
-    period = seconds(c.period_ns())
+    period, trajectory = seconds(c.period_ns()), reference_law(c.reference)
     trace = empty_trace(c.ticks(), len(units))
     with monitor:
         sample = monitor.tick()
@@ -75,12 +75,22 @@ def through_volts(configuration, hardware, **options):
             strain, force, source = (float(value) for value in sample.values[:3])
             pressure = sample.values[4:].copy()
             time = seconds(k * c.period_ns())
-            reference = strain_reference(c.reference, time)
+            reference = strain_reference(trajectory, time)
             outer_state, asked = strain_loop_step(
                 outer, outer_state, reference, strain, source, pressure[0], period
             )
             policy_state, decided = recruitment_step(
-                policy, units, table, policy_state, strain, force, source, pressure, period
+                policy,
+                units,
+                table,
+                trajectory,
+                policy_state,
+                time,
+                strain,
+                force,
+                source,
+                pressure,
+                period,
             )
             pressure_loop_step(
                 inner,
