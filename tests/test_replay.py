@@ -207,7 +207,7 @@ def test_a_changed_gain_is_found_where_it_begins_to_act(
 
 
 def test_a_gain_of_the_inner_loop_changes_the_lags_too(bag: Path, tmp_path: Path) -> None:
-    gain = 1.01 * configured().pressure_loop.proportional_gain
+    gain = 1.01 * configured().pressure_loop.proportional_gain[0]
     config = parameters(tmp_path, pressure_loop={'proportional_gain': gain})
     assert not run_replay(bag, config, tmp_path, '')
     found = Found(tmp_path)

@@ -48,10 +48,14 @@ Command = Callable[[Any], list[float]]  # what a controller makes of a bundle_st
 
 def softer(loop: Any) -> Any:
     """Return a loop with smaller gains."""
+
+    def smaller(gain: Any) -> Any:  # one, or one per motor unit
+        return tuple(map(smaller, gain)) if isinstance(gain, tuple) else SOFTER * gain
+
     return dataclasses.replace(
         loop,
-        proportional_gain=SOFTER * loop.proportional_gain,
-        integral_gain=SOFTER * loop.integral_gain,
+        proportional_gain=smaller(loop.proportional_gain),
+        integral_gain=smaller(loop.integral_gain),
     )
 
 
@@ -192,7 +196,7 @@ class BridgeRig(Rig):
         """Keep some pressure in the first motor unit, and none in the others."""
         share = min(sample.tick * self.configuration.simulation.period / FILL, 1.0)
         wanted = GENTLE * share * self.configuration.source.nominal_pressure
-        gain = self.configuration.pressure_loop.proportional_gain
+        gain = self.configuration.pressure_loop.proportional_gain[0]
         spool = gain * (wanted - sample.mu_pressure[0])
         return [min(max(spool, -1.0), 1.0)] + [-1.0] * (len(sample.mu_pressure) - 1)
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The strongest rival of an anticipatory scheme: a threshold tuned on the very reference."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fam_bundle_bringup.experiment import measure_tracking
+from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_bringup.offline import run_offline
-from fam_bundle_io.metrics import Tracking, shift_times
-from fam_bundle_io.trace import Trace
+from fam_bundle_io.metrics import Tracking, needless_shifts
 from fam_bundle_model.lag_table import cached_lag_table
 from fam_bundle_model.parameters import Configuration
 
@@ -18,10 +19,11 @@ THRESHOLDS = tuple(np.round(np.arange(0.40, 0.951, 0.01), 2).tolist())
 
 
 class Rival(NamedTuple):
-    """The best upshift threshold, and how well the baseline tracks with it."""
+    """The best upshift threshold, how well it tracks, and how many thresholds do not chatter."""
 
     threshold: float
     tracking: Tracking
+    steady: int
 
 
 def with_threshold(configuration: Configuration, threshold: float) -> Configuration:
@@ -32,31 +34,26 @@ def with_threshold(configuration: Configuration, threshold: float) -> Configurat
     return dataclasses.replace(configuration, recruitment=recruitment)
 
 
-def chatters(configuration: Configuration, trace: Trace) -> bool:
-    """Return whether a run shifted more than once up and once down per cycle."""
-    up, down = shift_times(trace)
-    cycles = configuration.reference.cycles
-    return len(up) > cycles or len(down) > cycles
-
-
 def best_threshold(
     configuration: Configuration, progress: Callable[[int], None] | None = None
 ) -> Rival | None:
     """Return the threshold with the least IAE among those that do not chatter, if there is one.
 
-    The runs are offline. ``progress`` is called with the thresholds tried so far.
+    The runs are offline; one that diverges is no rival. ``progress`` is called with the
+    thresholds tried so far.
     """
     table = cached_lag_table(configuration)
-    best: Rival | None = None
+    steady: dict[float, Tracking] = {}
     for k, threshold in enumerate(THRESHOLDS, 1):
-        if threshold <= configuration.recruitment.downshift_threshold:
-            continue
-        tried = with_threshold(configuration, threshold)
-        trace = run_offline(tried, table=table)
-        found = measure_tracking(tried, trace)
-        better = best is None or found.iae < best.tracking.iae
-        if better and not chatters(tried, trace):
-            best = Rival(threshold, found)
+        if threshold > configuration.recruitment.downshift_threshold:
+            tried = with_threshold(configuration, threshold)
+            with contextlib.suppress(RunFailed):
+                trace = run_offline(tried, table=table)
+                if not needless_shifts(trace):
+                    steady[threshold] = measure_tracking(tried, trace)
         if progress is not None:
             progress(k)
-    return best
+    if not steady:
+        return None
+    best = min(steady, key=lambda threshold: steady[threshold].iae)
+    return Rival(best, steady[best], len(steady))

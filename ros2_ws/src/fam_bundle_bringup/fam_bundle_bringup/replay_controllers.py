@@ -254,7 +254,7 @@ def pressure_answers(
     """
     samples = run.samples
     units = samples.mu_pressure.shape[1]
-    gains, integral = pressure_gains(configuration.pressure_loop), np.zeros(units)
+    gains, integral = pressure_gains(configuration), np.zeros(units)
     wanted, spool, saturated = np.zeros(units), np.zeros(units), np.zeros(units, dtype=np.bool_)
     filled, none = (wanted, spool, saturated), (0, 0.0, 0.0, 0.0, np.zeros(units), 1.0)
     step = direct(pressure_loop_step, gains, integral, *none, *filled)

@@ -26,7 +26,7 @@ class PressureController(Controller):
         """Compile the law before the first tick needs it."""
         super().__init__('pressure_controller', ('fam', 'pressure_loop', 'simulation'))
         units = len(self.configuration.fam.count)
-        self.gains = pressure_gains(self.configuration.pressure_loop)
+        self.gains = pressure_gains(self.configuration)
         self.integral = np.zeros(units)
         self.wanted, self.spool = np.zeros(units), np.zeros(units)
         self.saturated = np.zeros(units, dtype=np.bool_)

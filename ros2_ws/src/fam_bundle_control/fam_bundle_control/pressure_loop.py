@@ -19,7 +19,7 @@ def is_compensated(unit: int, recruited: int) -> bool:
 
 @compiled
 def pressure_loop_step(
-    gains: PressureGains,
+    gains: tuple[PressureGains, ...],
     integral: npt.NDArray[np.float64],
     recruited: int,
     pressure_reference: float,
@@ -33,6 +33,7 @@ def pressure_loop_step(
 ) -> None:
     """Update ``integral`` and fill ``references`` (Pa), ``spool`` and ``saturated``, all (units,).
 
+    Each unit has its own ``gains``: its loop is the faster, the less oil it holds.
     Recruited units follow the pressure reference, those before the newest with the compensation
     on top, none above the source pressure (Pa). The others are vented: reference zero and no
     integral share, so that a unit is recruited without a bump. ``dt`` in s.
@@ -44,7 +45,7 @@ def pressure_loop_step(
             references[i] = clamp(pressure_reference + added, 0.0, max(source_pressure, 0.0))
         else:
             integral[i] = 0.0
-        share, asked = pressure_pi(gains, integral[i], references[i], mu_pressure[i], dt)
+        share, asked = pressure_pi(gains[i], integral[i], references[i], mu_pressure[i], dt)
         integral[i] = share
         spool[i] = clamp(asked, -1.0, 1.0)
         saturated[i] = spool[i] != asked

@@ -37,7 +37,7 @@ def evaluate():
     for scheme in ('baseline', 'lag_pressure'):
         part = dataclasses.replace(configuration.recruitment, scheme=scheme)
         policy = recruitment(dataclasses.replace(configuration, recruitment=part))
-        outer, gains = strain_loop(configuration), pressure_gains(configuration.pressure_loop)
+        outer, gains = strain_loop(configuration), pressure_gains(configuration)
         state, outer_state = recruitment_start(), strain_loop_start()
         integral, references, spool = np.zeros((3, 2))
         saturated = np.zeros(2, dtype=bool)

@@ -38,7 +38,7 @@ def test_units_are_recruited_in_order_and_released_in_reverse(
         )
         visited.append(output.recruited)
         pressure_loop_step(
-            PressureGains(5e-6, 1e-6, 0.3),
+            (PressureGains(5e-6, 1e-6, 0.3),) * count,
             integral,
             output.recruited,
             4e5,

@@ -14,14 +14,15 @@ GAINS = PressureGains(5e-6, 2e-6, 0.3)
 class Loops:
     """The inner loops of ``count`` units, their pressures given."""
 
-    def __init__(self, count):
+    def __init__(self, count, gains=None):
+        self.gains = gains or (GAINS,) * count
         self.integral = np.zeros(count)
         self.references, self.spool = np.full((2, count), np.nan)
         self.saturated = np.zeros(count, dtype=bool)
 
     def step(self, recruited, pressures, reference=4e5, compensation=0.0, source=6.5e5):
         pressure_loop_step(
-            GAINS,
+            self.gains,
             self.integral,
             recruited,
             reference,
@@ -104,3 +105,15 @@ def test_units_do_not_see_each_other():
     together = Loops(2).step(2, [1e5, 3e5]).spool.copy()
     swapped = Loops(2).step(2, [3e5, 1e5]).spool
     assert together.tolist() == swapped[::-1].tolist()
+
+
+def test_each_unit_has_its_own_gains():
+    small, large = GAINS._replace(proportional=2e-6), GAINS._replace(integral_limit=0.1)
+    together = Loops(2, (small, large))
+    alone = Loops(1, (small,)), Loops(1, (large,))
+    for _ in range(20000):
+        together.step(2, [3.5e5, 3.7e5])
+        for loop, pressure in zip(alone, (3.5e5, 3.7e5), strict=True):
+            loop.step(1, [pressure])
+    assert together.spool.tolist() == [loop.spool[0] for loop in alone]
+    assert together.integral.tolist() == [GAINS.integral_limit, 0.1]

@@ -51,7 +51,7 @@ def response_figure(configuration: Configuration) -> Figure:
     target, limit = TARGET * nominal, configuration.lag_table.maximum_lag
     units = motor_units(configuration)
     unit = min(1, len(units) - 1)
-    law, gains = hydraulic_law(configuration), pressure_gains(configuration.pressure_loop)
+    law, gains = hydraulic_law(configuration), pressure_gains(configuration)[unit]
     substeps = configuration.simulation.substeps
     rows = np.empty((int(limit / period), 5))
     lag, drop = fill_response(law, gains, units[unit], target, limit, period, substeps, rows)

@@ -13,6 +13,7 @@ from fam_bundle_model.parameters import Configuration
 SATURATED = 0.97  # share of the source pressure from which a unit counts as saturated
 AT_LEAST = 1e-3  # share of the reference's range within which it is at its least
 SLACK = 1e-9  # s by which rounding may move the edge of a window
+SWING = 0.05  # share of the reference's range by which it must turn to ask for another shift
 
 
 class Tracking(NamedTuple):
@@ -67,6 +68,42 @@ def shift_times(trace: Trace) -> tuple[list[float], list[float]]:
     before = 1 if time.size and time[0] == 0.0 else state[:1]
     change = np.diff(state, prepend=before)
     return time[change > 0].tolist(), time[change < 0].tolist()
+
+
+def shortest_interval(trace: Trace) -> float:
+    """Return the least time in s between two shifts; infinity with fewer than two."""
+    up, down = shift_times(trace)
+    return float(np.diff(sorted(up + down)).min(initial=np.inf))
+
+
+def needless_shifts(trace: Trace) -> int:
+    """Return how many shifts the reference gave no reason for: none unless the scheme chatters.
+
+    The reference has to cross the strain at which a step of the ladder is needed once for each
+    shift over that step. Wherever that strain is, between two upshifts over one step the
+    reference must then have fallen and risen again, between two downshifts risen and fallen. If
+    it did not, by more than ``SWING`` of its range, the second shift was needless. An upshift
+    acts one recruitment lag later: it may come as much before the reference turns.
+    """
+    reference, state = trace['strain_reference'], trace['recruitment_state'].astype(int)
+    before = np.concatenate(([1 if trace['time'][0] == 0.0 else state[0]], state[:-1]))
+    enough = SWING * float(np.ptp(reference))
+    lag = np.where(np.isfinite(trace['recruitment_lag']), trace['recruitment_lag'], 0.0)
+    until = np.searchsorted(trace['time'], trace['time'] + lag, side='right')
+    needless = 0
+    for step in range(int(state.min()), int(state.max())):
+        ups = np.flatnonzero((before <= step) & (state > step))
+        needless += sum(_dip(reference[a : until[b]]) <= enough for a, b in pairwise(ups))
+        downs = np.flatnonzero((before > step) & (state <= step))
+        needless += sum(_dip(-reference[a : b + 1]) <= enough for a, b in pairwise(downs))
+    return needless
+
+
+def _dip(values: npt.NDArray[np.float64]) -> float:
+    """Return how far ``values`` fall and rise again."""
+    left = np.maximum.accumulate(values)
+    right = np.maximum.accumulate(values[::-1])[::-1]
+    return float((np.minimum(left, right) - values).max())
 
 
 # ---- Cycles ----

@@ -141,7 +141,7 @@ def _fill_table(
 def build_lag_table(configuration: Configuration) -> LagTable:
     """Return the table of ``configuration``: source from its minimum, de-slack pressure from 0.
 
-    Motor units with equal FAMs and count are computed once.
+    Motor units with equal FAMs, count and gains are computed once.
     """
     grid, nominal = configuration.lag_table, configuration.source.nominal_pressure
     units = motor_units(configuration)
@@ -149,13 +149,13 @@ def build_lag_table(configuration: Configuration) -> LagTable:
     targets = _axis(0.0, nominal, grid.deslack_points)
     shape = (len(units), grid.source_points, grid.deslack_points)
     lag, drop = np.empty(shape), np.empty(shape)
-    first: dict[tuple[float, int], int] = {}
-    for i, unit in enumerate(units):
-        same = first.setdefault((unit.fams, id(unit.fam)), i)
+    first: dict[tuple[float, int, PressureGains], int] = {}
+    for i, (unit, gains) in enumerate(zip(units, pressure_gains(configuration), strict=True)):
+        same = first.setdefault((unit.fams, id(unit.fam), gains), i)
         if same == i:
             _fill_table(
                 hydraulic_law(configuration),
-                pressure_gains(configuration.pressure_loop),
+                gains,
                 unit,
                 grid.maximum_lag,
                 configuration.simulation.period,

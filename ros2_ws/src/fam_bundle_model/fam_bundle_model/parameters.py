@@ -133,9 +133,15 @@ class StrainLoopParameters:
 class PressureLoopParameters:
     """Inner PI of each motor unit; its output is the spool command (Figure 3b, c)."""
 
-    proportional_gain: float = number('1/Pa', 'spool per pressure error', minimum=0.0)
-    integral_gain: float = number('1/(Pa s)', 'spool rate per pressure error', minimum=0.0)
-    integral_limit: float = number('', 'largest integral share', minimum=0.0, maximum=1.0)
+    proportional_gain: tuple[float, ...] = per_unit(
+        float, '1/Pa', 'spool per pressure error', minimum=0.0
+    )
+    integral_gain: tuple[float, ...] = per_unit(
+        float, '1/(Pa s)', 'spool rate per pressure error', minimum=0.0
+    )
+    integral_limit: tuple[float, ...] = per_unit(
+        float, '', 'largest integral share', minimum=0.0, maximum=1.0
+    )
 
 
 @dataclass(frozen=True)
@@ -326,6 +332,9 @@ def make_configuration(
     configuration = Configuration(**groups)
     if configuration.fam is not None:
         check_fam(configuration.fam)
+        check_lengths('fam', configuration.fam, configuration.fam)
+    if configuration.fam is not None and configuration.pressure_loop is not None:
+        check_lengths('pressure_loop', configuration.pressure_loop, configuration.fam)
     if configuration.recruitment is not None:
         check_recruitment(configuration.recruitment)
     if configuration.run is not None and configuration.simulation is not None:
@@ -347,16 +356,23 @@ def check_run(run: RunParameters, simulation: SimulationParameters) -> None:
 
 
 def check_fam(fam: FamParameters) -> None:
-    """Raise ConfigurationError unless each parameter has one value, or one per motor unit."""
-    units = len(fam.count)
+    """Raise ConfigurationError unless the FAMs are equally long."""
     if len(set(fam.length)) > 1:
         raise ConfigurationError(
             f'fam.length = {list(fam.length)} m: must be equal, for all FAMs share one strain'
         )
-    for name, value in dataclasses.asdict(fam).items():
+
+
+def check_lengths(
+    group: str, values: FamParameters | PressureLoopParameters, fam: FamParameters
+) -> None:
+    """Raise ConfigurationError unless each parameter has one value, or one per motor unit."""
+    units = len(fam.count)
+    for name, value in vars(values).items():
         if len(value) not in (1, units):
             raise ConfigurationError(
-                f'fam.{name}: {len(value)} values for {units} motor units; must be 1 or {units}'
+                f'{group}.{name}: {len(value)} values for {units} motor units; '
+                f'must be 1 or {units}'
             )
 
 

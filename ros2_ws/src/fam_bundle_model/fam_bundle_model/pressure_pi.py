@@ -8,22 +8,24 @@ It stands in the model because the recruitment lag is the lag of valve, hose and
 from typing import NamedTuple
 
 from fam_bundle_model.compile import compiled
-from fam_bundle_model.parameters import PressureLoopParameters
+from fam_bundle_model.fam import value_of
+from fam_bundle_model.parameters import Configuration
 
 
 class PressureGains(NamedTuple):
-    """Gains in 1/Pa and 1/(Pa s), and the largest integral share of the spool command."""
+    """One unit's gains in 1/Pa and 1/(Pa s), and the largest integral share of its command."""
 
     proportional: float
     integral: float
     integral_limit: float
 
 
-def pressure_gains(parameters: PressureLoopParameters) -> PressureGains:
-    """Return the gains of ``parameters``."""
-    return PressureGains(
-        parameters.proportional_gain, parameters.integral_gain, parameters.integral_limit
-    )
+def pressure_gains(configuration: Configuration) -> tuple[PressureGains, ...]:
+    """Return the gains of each motor unit of ``configuration``."""
+    p = configuration.pressure_loop
+    given = (p.proportional_gain, p.integral_gain, p.integral_limit)
+    units = range(len(configuration.fam.count))
+    return tuple(PressureGains(*(value_of(v, i) for v in given)) for i in units)
 
 
 @compiled

@@ -31,7 +31,7 @@ def evaluate():
     configuration = load_configuration(CONFIGURATION)
     units = bundle.motor_units(configuration)
     supply = hydraulics.hydraulic_law(configuration)
-    gains = pressure_pi.pressure_gains(configuration.pressure_loop)
+    gains = pressure_pi.pressure_gains(configuration)[1]
     law, modulus = units[0].fam, supply.bulk_modulus
     axis = np.linspace(0.0, 7e5, 5)
     table = lag_table.LagTable(

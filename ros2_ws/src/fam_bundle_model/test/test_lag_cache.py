@@ -77,7 +77,7 @@ def test_the_second_call_reads_what_the_first_has_built(cache):
 def test_another_gain_builds_another_table(cache):
     configuration, builds = cache
     cached_lag_table(configuration)
-    loop = dataclasses.replace(configuration.pressure_loop, proportional_gain=1e-5)
+    loop = dataclasses.replace(configuration.pressure_loop, proportional_gain=(1e-5,))
     cached_lag_table(dataclasses.replace(configuration, pressure_loop=loop))
     cached_lag_table(configuration)
     assert len(builds) == 2
@@ -118,5 +118,5 @@ def test_hash_depends_on_what_the_lag_depends_on_and_on_nothing_else(configurati
     assert other('load', mass=1.0) == same
     assert other('hose', length=9.0) != same
     assert other('simulation', period=0.01) != same
-    assert other('pressure_loop', integral_limit=0.123) != same
+    assert other('pressure_loop', integral_limit=(0.123,)) != same
     assert other('fam', count=(1, 7)) != same

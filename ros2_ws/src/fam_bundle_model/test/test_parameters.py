@@ -113,6 +113,10 @@ def test_a_wrong_number_of_values_is_refused(values, given):
     values['fam'].update(count=[2, 2, 2], thickness=[0.0016] * given)
     expected = f'fam.thickness: {given} values for 3 motor units; must be 1 or 3'
     assert complaint(values) == expected
+    values['fam']['thickness'] = 0.0016
+    values['pressure_loop']['integral_gain'] = [1e-6] * given
+    expected = f'pressure_loop.integral_gain: {given} values for 3 motor units; must be 1 or 3'
+    assert complaint(values) == expected
 
 
 def test_fams_of_different_lengths_are_refused(values):

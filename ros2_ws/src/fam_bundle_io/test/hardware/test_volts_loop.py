@@ -62,7 +62,7 @@ def through_volts(configuration, hardware, **options):
     monitor = Monitor(
         load_backend('volts'), setup, hardware.limits, c.source.nominal_pressure, clock=None
     )
-    laws = strain_loop(c), recruitment(c), cached_lag_table(c), pressure_gains(c.pressure_loop)
+    laws = strain_loop(c), recruitment(c), cached_lag_table(c), pressure_gains(c)
     outer, policy, table, inner = laws
     outer_state, policy_state, integral = strain_loop_start(), recruitment_start(), np.zeros(2)
     wanted, spool, saturated = np.empty(2), np.empty(2), np.empty(2, dtype=np.bool_)
