@@ -49,6 +49,12 @@ def checked_configuration(
     Raises ConfigurationError naming parameter, value and bound.
     """
     configuration = load_configuration(path, changes)
+    check_feasible(configuration)
+    return configuration
+
+
+def check_feasible(configuration: Configuration) -> None:
+    """Raise ConfigurationError, naming parameter, value and bound, unless the rig can run it."""
     check_reachable(configuration, motor_units(configuration))
     ticks, cycles = configuration.ticks(), configuration.reference.cycles
     if ticks < 2 * cycles:
@@ -61,7 +67,6 @@ def checked_configuration(
             f'reference.cycles = {cycles}: must be <= {LARGEST_RUN * cycles // ticks}, for a '
             f'trace holds at most {LARGEST_RUN} ticks'
         )
-    return configuration
 
 
 def last_cycle(configuration: Configuration) -> tuple[float, float]:
