@@ -25,7 +25,7 @@ from fam_bundle_bringup.experiment import (
 from fam_bundle_bringup.one_line_parser import Parser
 from fam_bundle_bringup.rig_commands import NAMES as RIG_COMMANDS
 from fam_bundle_bringup.rig_commands import add_rig_commands, run_rig_command
-from fam_bundle_model.parameters import SCHEMES, Configuration
+from fam_bundle_model.parameters import PREDICTORS, SCHEMES, Configuration
 from fam_bundle_model.schema import ConfigurationError
 
 NAMED = 3  # of what a bag misses
@@ -87,6 +87,11 @@ def _add_experiment(commands: Any) -> None:
         '--scheme',
         metavar='|'.join(SCHEMES),
         help='what decides a shift, and what is compensated (default: as configured)',
+    )
+    experiment.add_argument(
+        '--predictor',
+        metavar='|'.join(PREDICTORS),
+        help='how the strain is expected to go on (default: as configured)',
     )
     experiment.add_argument(
         '--threshold',
@@ -156,6 +161,7 @@ def changes_of(options: argparse.Namespace) -> Mapping[str, Mapping[str, Any]]:
     """Return the configuration changes that the options ask for."""
     wanted = {
         ('recruitment', 'scheme'): options.scheme,
+        ('recruitment', 'predictor'): options.predictor,
         ('recruitment', 'upshift_threshold'): options.threshold,
         ('reference', 'kind'): options.reference,
         ('reference', 'amplitude'): options.amplitude,

@@ -122,6 +122,7 @@ def run_block(
         row[8] = decided.deslack_pressure
         row[9] = seen.force
         row[10] = seen.source_flow
+        row[11] = decided.prediction_error
         plant_step(rig, plant_state, spool, period, substeps)
     return outer_state, policy_state
 
@@ -139,6 +140,7 @@ COLUMNS = (
     'deslack_pressure',
     'force',
     'source_flow',
+    'prediction_error',
 )
 
 

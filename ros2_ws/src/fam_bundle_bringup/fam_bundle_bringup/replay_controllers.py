@@ -56,6 +56,7 @@ UNITS = {
     'time_to_desaturation': 's',
     'pressure_compensation': 'Pa',
     'lag_outside_table': '',
+    'prediction_error': '',
     'spool': '',
     'pressure_reference': 'Pa',
     'saturated': '',
@@ -222,7 +223,7 @@ def supervisor_answers(
     law, units = recruitment(configuration), motor_units(configuration)
     memory, trajectory = recruitment_start(), reference_law(configuration.reference)
     none = np.zeros(len(units))
-    model = (law, units, table, trajectory, memory)
+    model = (law, units, table, trajectory, recruitment_start())
     decide = direct(recruitment_step, *model, 0.0, 0.0, 0.0, 0.0, none, 1.0)
     rows = []
     for row, dt, anew, _ in zip(*steps, strict=True):

@@ -1,79 +1,297 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The expected trajectory E(t) of equation 14, from what has been measured so far."""
+"""The expected trajectory E(t) of equation 14, by one of four predictors.
+
+- constant rate: the measured strain goes on at its filtered rate (the paper's);
+- constant acceleration: a parabola, its acceleration over the next ``REACH`` only;
+- sinusoid: what the adaptive sinusoid of ``sinusoid.py`` does next;
+- preview: what the reference does next, at the present tracking error.
+
+All but the first stand on a filter of the strain that moves along with the trajectory: it takes
+noise away without a lag. Acceleration and sinusoid are weighed against the constant rate by how
+well each has done lately. ``docs/recruitment.md`` compares them.
+"""
 
 import math
 from typing import NamedTuple
 
+from fam_bundle_control.filters import (
+    Cascade,
+    cascade_derivatives,
+    cascade_step,
+    filtered,
+    resting_cascade,
+)
+from fam_bundle_control.forecasts import (
+    Forecasts,
+    due,
+    forecasts_start,
+    forecasts_step,
+    is_due,
+    next_row,
+)
+from fam_bundle_control.sinusoid import (
+    Sinusoid,
+    sinusoid_ahead,
+    sinusoid_start,
+    sinusoid_step,
+)
 from fam_bundle_model.compile import compiled
-from fam_bundle_model.parameters import RecruitmentParameters
+from fam_bundle_model.parameters import PREDICTORS, Configuration
+from fam_bundle_model.reference import Reference, strain_reference
+
+CONSTANT_RATE, CONSTANT_ACCELERATION, SINUSOID, PREVIEW = range(len(PREDICTORS))
+REACH = 0.4  # s for which an acceleration is expected to last
+ACCELERATION_TIME_CONSTANT = 0.06  # s, of each of its four filters
+POSITION_TIME_CONSTANT = 0.05  # s, of the filter that moves along
+MEMORY = 1.0  # s, of the comparison with the constant rate
+DOUBT = 1e-10  # mean squared difference (strain) below which the comparison tells nothing
+FAR, STEPS, HALVINGS = 2.0, 40, 30  # s that are searched for a crossing, in steps, then halved
+EXPECTED, BY_RATE, BY_MODEL = range(3)  # columns of the forecasts
 
 
 class Predictor(NamedTuple):
-    """Settings: filter of the strain rate in s, and the rate in 1/s below which nothing moves."""
+    """Settings: which one, filter of the strain rate in s, rate in 1/s below which nothing moves.
 
+    ``horizon`` (s) is how far ahead its error is measured.
+    """
+
+    kind: int
     strain_rate_time_constant: float
     minimum_strain_rate: float
+    horizon: float
 
 
 class PredictorState(NamedTuple):
-    """What is remembered: the last strain and its filtered rate in 1/s."""
+    """What is remembered: the last strain, its filtered rate in 1/s, and what the models know.
+
+    ``time`` is that of the last tick in s, ``position`` the strain without noise, ``velocity``
+    and ``acceleration`` its derivatives, ``weight`` that of the model against the constant rate
+    and ``agreement`` over ``difference`` what it comes from, ``error`` the measured strain less
+    what was expected for it a horizon ago (0 until then).
+    """
 
     strain: float
     strain_rate: float
     started: bool
+    time: float
+    position: float
+    velocity: float
+    acceleration: float
+    filters: Cascade
+    sinusoid: Sinusoid
+    weight: float
+    agreement: float
+    difference: float
+    forecasts: Forecasts
+    error: float
 
 
-def predictor(parameters: RecruitmentParameters) -> Predictor:
-    """Return the predictor of ``parameters``."""
-    return Predictor(parameters.strain_rate_time_constant, parameters.minimum_strain_rate)
+def predictor(configuration: Configuration) -> Predictor:
+    """Return the predictor of ``configuration``; a live reference has no preview."""
+    p = configuration.recruitment
+    kind = PREDICTORS.index(p.predictor)
+    return Predictor(
+        CONSTANT_RATE if kind == PREVIEW and configuration.reference.kind == 'topic' else kind,
+        p.strain_rate_time_constant,
+        p.minimum_strain_rate,
+        p.prediction_horizon,
+    )
 
 
 def predictor_start() -> PredictorState:
-    """Return the state before the first tick."""
-    return PredictorState(0.0, 0.0, False)
-
-
-@compiled
-def filtered(previous: float, value: float, time_constant: float, dt: float) -> float:
-    """Return the next output of a first-order low-pass filter (backward Euler)."""
-    return previous + (value - previous) * dt / (time_constant + dt)
+    """Return the state before the first tick; ``predictor_step`` writes in its forecasts."""
+    still = (0.0, 0.0, 0.0, 0.0)
+    return PredictorState(
+        strain=0.0,
+        strain_rate=0.0,
+        started=False,
+        time=0.0,
+        position=0.0,
+        velocity=0.0,
+        acceleration=0.0,
+        filters=Cascade(*still),
+        sinusoid=Sinusoid(Cascade(*still), 0.0, 0.0, 0.0, 0.0, 1.0),
+        weight=0.0,
+        agreement=0.0,
+        difference=0.0,
+        forecasts=forecasts_start(3),
+        error=0.0,
+    )
 
 
 @compiled
 def predictor_step(
-    law: Predictor, state: PredictorState, strain: float, dt: float
+    law: Predictor,
+    state: PredictorState,
+    reference: Reference,
+    time: float,
+    strain: float,
+    dt: float,
 ) -> PredictorState:
-    """Return the next state from one tick's measured strain; ``dt`` in s."""
+    """Return the next state from one tick's measured strain; ``time`` and ``dt`` in s.
+
+    The forecasts are written in place.
+    """
     rate = 0.0
     if state.started:
         rate = (strain - state.strain) / dt
         rate = filtered(state.strain_rate, rate, law.strain_rate_time_constant, dt)
-    return PredictorState(strain, rate, True)
+    filters, sinusoid = state.filters, state.sinusoid
+    velocity = acceleration = advance = 0.0
+    if law.kind == CONSTANT_ACCELERATION:
+        filters = resting_cascade(strain)
+        if state.started:
+            filters = cascade_step(state.filters, strain, ACCELERATION_TIME_CONSTANT, dt)
+        slope, acceleration, _ = cascade_derivatives(filters, ACCELERATION_TIME_CONSTANT)
+        # A parabola passes the filters 4 time constants late; dt / 2: differences look back.
+        advance = (slope + 4.0 * ACCELERATION_TIME_CONSTANT * acceleration) * dt
+        velocity = advance / dt + 0.5 * dt * acceleration
+    elif law.kind == SINUSOID:
+        sinusoid = sinusoid_start(strain)
+        if state.started:
+            sinusoid = sinusoid_step(state.sinusoid, strain, dt)
+        velocity, acceleration = sinusoid.velocity, sinusoid.acceleration
+        advance = (velocity - 0.5 * dt * acceleration) * dt
+    elif law.kind == PREVIEW and state.started:
+        advance = strain_reference(reference, time) - strain_reference(reference, state.time)
+    position = strain
+    if state.started:
+        position = filtered(state.position + advance, strain, POSITION_TIME_CONSTANT, dt)
+
+    forecasts = forecasts_step(state.forecasts, law.horizon, dt if state.started else 0.0)
+    error, agreement, difference = 0.0, state.agreement, state.difference
+    if is_due(forecasts, law.horizon):
+        error = strain - due(forecasts, EXPECTED, law.horizon)
+        by_rate = due(forecasts, BY_RATE, law.horizon)
+        apart = due(forecasts, BY_MODEL, law.horizon) - by_rate
+        agreement = filtered(agreement, (strain - by_rate) * apart, MEMORY, dt)
+        difference = filtered(difference, apart * apart, MEMORY, dt)
+    at_first = DOUBT if law.kind == CONSTANT_ACCELERATION else 0.0
+    weight = min(max((agreement + at_first) / (difference + DOUBT), 0.0), 1.0)
+    forecasts, row = next_row(forecasts, law.horizon)
+    new = PredictorState(
+        strain,
+        rate,
+        True,
+        time,
+        position,
+        velocity,
+        acceleration,
+        filters,
+        sinusoid,
+        weight,
+        agreement,
+        difference,
+        forecasts,
+        error,
+    )
+    if row >= 0:
+        rows = forecasts.rows
+        rows[row, 1 + EXPECTED] = expected_strain(law, new, reference, law.horizon)
+        rows[row, 1 + BY_RATE] = strain + rate * law.horizon
+        rows[row, 1 + BY_MODEL] = modelled(law, new, law.horizon)
+    return new
 
 
 @compiled
-def expected_strain(state: PredictorState, ahead: float) -> float:
-    """Return the strain expected ``ahead`` s from now: equation 14."""
-    return state.strain + state.strain_rate * ahead
+def modelled(law: Predictor, state: PredictorState, ahead: float) -> float:
+    """Return the strain ``ahead`` s from now by the parabola or the sinusoid."""
+    if law.kind == SINUSOID:
+        return state.position + sinusoid_ahead(state.sinusoid, ahead)
+    lasts = min(ahead, REACH)
+    bend = state.acceleration * lasts * (ahead - 0.5 * lasts)
+    return state.position + state.velocity * ahead + bend
 
 
 @compiled
-def time_to_rise(law: Predictor, state: PredictorState, target: float) -> float:
+def expected_strain(
+    law: Predictor, state: PredictorState, reference: Reference, ahead: float
+) -> float:
+    """Return the strain expected ``ahead`` s from now: equation 14 at constant rate."""
+    by_rate = state.strain + state.strain_rate * ahead
+    if law.kind == CONSTANT_RATE:
+        return by_rate
+    if law.kind == PREVIEW:
+        coming = strain_reference(reference, state.time + ahead)
+        return state.position + coming - strain_reference(reference, state.time)
+    return by_rate + state.weight * (modelled(law, state, ahead) - by_rate)
+
+
+@compiled
+def may_rise(law: Predictor, state: PredictorState) -> bool:
+    """Return whether ``time_to_rise`` can be finite; else what it asks for need not be known."""
+    return law.kind != CONSTANT_RATE or state.strain_rate > law.minimum_strain_rate
+
+
+@compiled
+def may_fall(law: Predictor, state: PredictorState) -> bool:
+    """Return whether ``time_to_fall`` can be finite; else what it asks for need not be known."""
+    return law.kind != CONSTANT_RATE or state.strain_rate < -law.minimum_strain_rate
+
+
+@compiled
+def time_to_rise(
+    law: Predictor, state: PredictorState, reference: Reference, target: float
+) -> float:
     """Return the time in s until the strain is expected to rise to ``target``: equation 15.
 
-    Negative where it has passed it; infinite where it is not expected to rise.
+    The first time at which it is there or above, and rising. Negative where it is now: by its
+    present rate, when it passed. Infinite where it is not expected to within ``FAR``.
     """
-    if state.strain_rate <= law.minimum_strain_rate:
-        return math.inf
-    return (target - state.strain) / state.strain_rate
+    if law.kind == CONSTANT_RATE:
+        if state.strain_rate <= law.minimum_strain_rate:
+            return math.inf
+        return (target - state.strain) / state.strain_rate
+    return _time_to_cross(law, state, reference, 1.0, target)
 
 
 @compiled
-def time_to_fall(law: Predictor, state: PredictorState, target: float) -> float:
+def time_to_fall(
+    law: Predictor, state: PredictorState, reference: Reference, target: float
+) -> float:
     """Return the time in s until the strain is expected to fall to ``target``: equation 16.
 
-    Negative where it has passed it; infinite where it is not expected to fall.
+    The mirror image of ``time_to_rise``.
     """
-    if state.strain_rate >= -law.minimum_strain_rate:
-        return math.inf
-    return (target - state.strain) / state.strain_rate
+    if law.kind == CONSTANT_RATE:
+        if state.strain_rate >= -law.minimum_strain_rate:
+            return math.inf
+        return (target - state.strain) / state.strain_rate
+    return _time_to_cross(law, state, reference, -1.0, target)
+
+
+@compiled
+def stays_above(
+    law: Predictor, state: PredictorState, reference: Reference, target: float, ahead: float
+) -> bool:
+    """Return whether the strain is above ``target`` still, ``ahead`` s from now.
+
+    For a trajectory that has risen to it by then; one at constant rate does not come back.
+    """
+    if law.kind == CONSTANT_RATE:
+        return True
+    return expected_strain(law, state, reference, ahead) >= target
+
+
+@compiled
+def _time_to_cross(
+    law: Predictor, state: PredictorState, reference: Reference, sign: float, target: float
+) -> float:
+    step, goal = FAR / STEPS, sign * target
+    here = sign * expected_strain(law, state, reference, 0.0)
+    for k in range(STEPS):
+        there = sign * expected_strain(law, state, reference, (k + 1) * step)
+        rate = (there - here) / step
+        if there >= goal and rate > law.minimum_strain_rate:
+            if here >= goal:
+                return (goal - here) / rate if k == 0 else k * step
+            low, high = k * step, (k + 1) * step
+            for _ in range(HALVINGS):
+                middle = 0.5 * (low + high)
+                if sign * expected_strain(law, state, reference, middle) >= goal:
+                    high = middle
+                else:
+                    low = middle
+            return high
+        here = there
+    return math.inf

@@ -14,13 +14,16 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fam_bundle_control.filters import filtered
 from fam_bundle_control.predictors import (
     Predictor,
     PredictorState,
-    filtered,
+    may_fall,
+    may_rise,
     predictor,
     predictor_start,
     predictor_step,
+    stays_above,
     time_to_fall,
     time_to_rise,
 )
@@ -68,13 +71,14 @@ class RecruitmentOutput(NamedTuple):
     time_to_desaturation: float
     pressure_compensation: float
     lag_outside_table: bool
+    prediction_error: float
 
 
 def recruitment(configuration: Configuration) -> Recruitment:
     """Return the law of ``configuration``."""
     p, nominal = configuration.recruitment, configuration.source.nominal_pressure
     return Recruitment(
-        predictor=predictor(p),
+        predictor=predictor(configuration),
         lag_compensation=p.scheme in ('lag', 'lag_pressure'),
         pressure_compensation=p.scheme in ('pressure', 'lag_pressure'),
         upshift_pressure=p.upshift_threshold * nominal,
@@ -85,7 +89,10 @@ def recruitment(configuration: Configuration) -> Recruitment:
 
 
 def recruitment_start() -> RecruitmentState:
-    """Return the state before the first tick, which finds the recruited units by pressure."""
+    """Return the state before the first tick, which finds the recruited units by pressure.
+
+    Each run needs its own: the law writes in the predictor's forecasts.
+    """
     return RecruitmentState(1, predictor_start(), 0.0, math.inf, False, False)
 
 
@@ -149,8 +156,7 @@ def recruitment_step(
     measurement, for ``reference``.
     """
     recruited, load = state.recruited, force
-    expected = predictor_step(law.predictor, state.expected, strain, dt)
-    rate = expected.strain_rate
+    expected = predictor_step(law.predictor, state.expected, reference, time, strain, dt)
     if not state.started:
         recruited = taut_units(units, mu_pressure, strain)
     else:
@@ -165,24 +171,30 @@ def recruitment_step(
         compensation = 0.0
 
     saturation = desaturation = math.inf
-    if recruited < len(units) and rate > law.predictor.minimum_strain_rate:
+    lasts = comes_back = False
+    if recruited < len(units) and may_rise(law.predictor, expected):
         effective = source_pressure - lag.drop - compensation
         limit = modelled_strain(units, recruited, effective, load)
-        saturation = time_to_rise(law.predictor, expected, limit)
+        saturation = time_to_rise(law.predictor, expected, reference, limit)
+        # A peak that is over before the unit is taut needs none.
+        lasts = stays_above(law.predictor, expected, reference, limit, lag.lag)
     release = lag
-    if recruited > 1 and rate < -law.predictor.minimum_strain_rate:
+    if recruited > 1 and may_fall(law.predictor, expected):
         newest_deslack = fam.deslack_pressure(units[newest].fam, strain)
         release = look_up(table, newest, source_pressure, newest_deslack)
         effective = source_pressure - release.drop - compensation
         limit = modelled_strain(units, recruited - 1, effective, load)
-        desaturation = time_to_fall(law.predictor, expected, limit)
+        desaturation = time_to_fall(law.predictor, expected, reference, limit)
+        # The unit could not be recruited again before the dwell is over, nor be taut a lag later.
+        again = release.lag + law.minimum_dwell
+        comes_back = time_to_rise(law.predictor, expected, reference, limit) <= again
 
     armed = state.armed
     if law.lag_compensation:
         armed = armed or mu_pressure[newest] >= fam.deslack_pressure(units[newest].fam, strain)
         # A lag of never: filling the next unit would take pressure and give nothing.
-        up = saturation <= lag.lag and lag.lag < math.inf
-        down = desaturation <= -release.lag
+        up = saturation <= lag.lag and lag.lag < math.inf and lasts
+        down = desaturation <= -release.lag and not comes_back
     else:
         armed = armed or mu_pressure[newest] > law.downshift_pressure
         up = recruited < len(units) and mu_pressure[0] >= law.upshift_pressure
@@ -196,7 +208,7 @@ def recruitment_step(
         recruited, dwell, armed = recruited - 1, 0.0, True
     output = RecruitmentOutput(
         recruited,
-        rate,
+        expected.strain_rate,
         deslack,
         lag.lag,
         lag.drop,
@@ -204,5 +216,6 @@ def recruitment_step(
         desaturation,
         compensation,
         lag.outside,
+        expected.error,
     )
     return RecruitmentState(recruited, expected, load, dwell, armed, True), output

@@ -59,7 +59,7 @@ class RecruitmentSupervisor(Controller):
             self.fail(f'lag_table: its parts do not fit together ({error})')
             return
         if first:
-            model = (self.law, self.units, self.table, self.trajectory, self.memory)
+            model = (self.law, self.units, self.table, self.trajectory, recruitment_start())
             measured = (0.0, 0.0, 0.0, 0.0, np.zeros(len(self.units)), 1.0)
             self.decide = direct(recruitment_step, *model, *measured)
             self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state)
@@ -91,6 +91,7 @@ class RecruitmentSupervisor(Controller):
         answer.time_to_desaturation = output.time_to_desaturation
         answer.pressure_compensation = output.pressure_compensation
         answer.lag_outside_table = output.lag_outside_table
+        answer.prediction_error = output.prediction_error
         self.publisher.publish(answer)
         self.meter.answered(seen.tick, seen.steady_time)
 

@@ -9,18 +9,19 @@ from scipy.optimize import brentq
 from scipy.signal import lfilter
 
 from fam_bundle_control.predictors import (
+    CONSTANT_RATE,
     Predictor,
-    PredictorState,
     expected_strain,
+    predictor_start,
     time_to_fall,
     time_to_rise,
 )
 from fam_bundle_control.recruitment import recruitment_start, recruitment_step
 from fam_bundle_model import fam
-from fam_bundle_model.reference import Reference
+from fam_bundle_model.reference import still
 
 DT = 0.001
-STILL = Reference(0.0, 1.0)
+STILL = still()
 RATE = 0.03  # 1/s
 
 
@@ -75,10 +76,11 @@ def test_time_to_saturation_solves_equation_15(supervise, units, law, constant_t
 def test_expected_strain_is_linear_in_time():
     """Equation 14, at the time of equation 15, is the strain sought."""
     for strain, rate in ((0.05, 0.02), (0.09, -0.01)):
-        state = PredictorState(strain, rate, True)
+        law = Predictor(CONSTANT_RATE, 0.03, 1e-3, 0.3)
+        state = predictor_start()._replace(strain=strain, strain_rate=rate, started=True)
         reach = time_to_rise if rate > 0.0 else time_to_fall
-        t = reach(Predictor(0.03, 1e-3), state, 0.07)
-        assert expected_strain(state, t) == pytest.approx(0.07)
+        t = reach(law, state, STILL, 0.07)
+        assert expected_strain(law, state, STILL, t) == pytest.approx(0.07)
 
 
 def test_the_upshift_comes_exactly_when_the_time_left_is_the_lag(supervise, law, constant_table):

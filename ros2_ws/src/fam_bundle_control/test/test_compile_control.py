@@ -21,15 +21,24 @@ from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.lag_table import LagTable
 from fam_bundle_model.parameters import load_configuration
 from fam_bundle_model.pressure_pi import pressure_gains
-from fam_bundle_model.reference import Reference
+from fam_bundle_model.reference import still
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
+
+
+def flat(values):
+    """Yield all numbers in nested tuples and arrays."""
+    for value in values:
+        if isinstance(value, tuple):
+            yield from flat(value)
+        else:
+            yield from np.ravel(value)
 
 
 def evaluate():
     """Return the bits of each tick's outputs, by scheme and law."""
     configuration = load_configuration(CONFIGURATION)
-    units, dt, still = motor_units(configuration), 1e-3, Reference(0.0, 1.0)
+    units, dt, held = motor_units(configuration), 1e-3, still()
     random = np.random.default_rng(5)
     axis = np.linspace(0.0, 7e5, 6)
     table = LagTable(axis, axis, random.random((2, 6, 6)), 1e5 * random.random((2, 6, 6)))
@@ -50,7 +59,7 @@ def evaluate():
                 outer, outer_state, strain + 1e-3, strain, source, pressures[0], dt
             )
             state, decided = recruitment_step(
-                policy, units, table, still, state, 0.0, strain, force, source, pressures, dt
+                policy, units, table, held, state, 0.0, strain, force, source, pressures, dt
             )
             pressure_loop_step(
                 gains,
@@ -70,7 +79,7 @@ def evaluate():
                     *asked,
                     *decided,
                     *state[:1],
-                    *state.expected,
+                    *flat(state.expected),
                     *state[2:],
                     *integral,
                     *references,

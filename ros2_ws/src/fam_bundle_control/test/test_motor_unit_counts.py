@@ -6,15 +6,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fam_bundle_control.predictors import PredictorState
+from fam_bundle_control.predictors import predictor_start
 from fam_bundle_control.pressure_loop import pressure_loop_step
 from fam_bundle_control.recruitment import recruitment_start, recruitment_step
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.pressure_pi import PressureGains
-from fam_bundle_model.reference import Reference
+from fam_bundle_model.reference import still
 
 DT = 0.001
-STILL = Reference(0.0, 1.0)
+STILL = still()
 
 
 @pytest.mark.parametrize('count', [1, 2, 3, 16])
@@ -103,7 +103,7 @@ def test_a_middle_state_is_released_although_the_next_unit_could_never_help(
     pressures = np.array([5e5, 5e5, 0.0])
     state = recruitment_start()._replace(
         recruited=2,
-        expected=PredictorState(0.14, 0.0, True),
+        expected=predictor_start()._replace(strain=0.14, started=True),
         force=180.0,
         dwell=9.0,
         armed=True,

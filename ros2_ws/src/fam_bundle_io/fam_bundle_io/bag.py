@@ -58,6 +58,7 @@ COLUMNS = {
         'recruitment_lag': 'recruitment_lag',
         'pressure_compensation': 'pressure_compensation',
         'deslack_pressure': 'deslack_pressure',
+        'prediction_error': 'prediction_error',
     },
     'fam_bundle_msgs/msg/ValveCommand': {'spool': 'spool'},
 }

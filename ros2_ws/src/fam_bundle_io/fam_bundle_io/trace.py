@@ -25,6 +25,7 @@ SCALARS = (
     'deslack_pressure',
     'force',
     'source_flow',
+    'prediction_error',
 )
 PER_UNIT = ('mu_pressure', 'spool')
 

@@ -130,6 +130,7 @@ def _fill_recruitment(trace: Trace, row: int, message: RecruitmentState) -> None
         'recruitment_lag',
         'pressure_compensation',
         'deslack_pressure',
+        'prediction_error',
     ):
         trace[name][row] = getattr(message, name)
 

@@ -29,6 +29,7 @@ from fam_bundle_model.schema import (
 
 PACES = ('lockstep', 'realtime')
 SCHEMES = ('baseline', 'lag', 'pressure', 'lag_pressure')
+PREDICTORS = ('constant_rate', 'constant_acceleration', 'sinusoid', 'preview')
 GRAVITY = 9.80665  # m/s^2
 
 _POSITIVE = {'minimum': 0.0, 'exclusive': True}
@@ -159,6 +160,16 @@ class RecruitmentParameters:
     force_time_constant: float = positive('s', 'filter of the measured force')
     minimum_strain_rate: float = positive('1/s', 'slower is taken as standing still')
     minimum_dwell: float = number('s', 'least time between two shifts', minimum=0.0)
+    predictor: str = choice(
+        'how the strain is expected to go on', PREDICTORS, default='constant_rate'
+    )
+    prediction_horizon: float = number(
+        's',
+        "how far ahead the predictor's error is measured",
+        default=0.3,
+        minimum=0.01,
+        maximum=5.0,
+    )
 
 
 @dataclass(frozen=True)

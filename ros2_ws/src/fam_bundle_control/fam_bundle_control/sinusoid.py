@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An unknown sinusoid with an offset, followed as it goes on: its frequency and its phase.
+
+For ``x = c + A sin(w t + p)`` the third derivative is ``-w^2`` times the first, whatever c, A and
+p are. Both are taken from a cascade of low-pass filters, and w^2 is their least-squares quotient
+with exponential forgetting: no guess of the frequency is needed, and none can be stuck in a wrong
+one. At a known w the cascade's gain and phase are known, so that its delay can be taken back. On
+a straight line w goes to its lower bound, and the sinusoid is a line over any lag.
+"""
+
+import math
+from typing import NamedTuple
+
+from fam_bundle_control.filters import (
+    Cascade,
+    cascade_derivatives,
+    cascade_step,
+    resting_cascade,
+)
+from fam_bundle_model.compile import compiled
+
+TIME_CONSTANT = 0.12  # s, of each filter of the cascade
+MEMORY = 3.0  # s, of the least squares
+SLOWEST, FASTEST = 2.0 * math.pi * 0.01, 2.0 * math.pi * 1.0  # rad/s
+
+
+class Sinusoid(NamedTuple):
+    """What is known of it: filters, least squares, and now its derivatives and frequency.
+
+    ``velocity`` (1/s) and ``acceleration`` (1/s^2) are those of the strain at the last tick,
+    ``frequency`` is in rad/s.
+    """
+
+    filters: Cascade
+    covariance: float
+    variance: float
+    velocity: float
+    acceleration: float
+    frequency: float
+
+
+@compiled
+def sinusoid_start(strain: float) -> Sinusoid:
+    """Return what is known at the first tick: standing still."""
+    return Sinusoid(resting_cascade(strain), 0.0, 0.0, 0.0, 0.0, SLOWEST)
+
+
+@compiled
+def sinusoid_step(state: Sinusoid, strain: float, dt: float) -> Sinusoid:
+    """Return what is known after one tick's measured strain; ``dt`` in s."""
+    filters = cascade_step(state.filters, strain, TIME_CONSTANT, dt)
+    one, two, three = cascade_derivatives(filters, TIME_CONSTANT)
+    share = dt / (MEMORY + dt)
+    covariance = state.covariance + (one * three - state.covariance) * share
+    variance = state.variance + (one * one - state.variance) * share
+    square = -covariance / variance if variance > 0.0 else 0.0
+    w = math.sqrt(min(max(square, SLOWEST * SLOWEST), FASTEST * FASTEST))
+    # The filtered derivatives turn with the phase; (1 + i w T)^4 takes the filters' share back.
+    lag = w * TIME_CONSTANT
+    real, imaginary = 1.0 - lag * lag, 2.0 * lag
+    real, imaginary = real * real - imaginary * imaginary, 2.0 * real * imaginary
+    side = two / w
+    velocity = one * real + side * imaginary
+    acceleration = (side * real - one * imaginary) * w
+    return Sinusoid(filters, covariance, variance, velocity, acceleration, w)
+
+
+@compiled
+def sinusoid_ahead(state: Sinusoid, ahead: float) -> float:
+    """Return how much the sinusoid will have risen ``ahead`` s from now."""
+    w = state.frequency
+    angle = w * ahead
+    half = math.sin(0.5 * angle)
+    return (
+        state.velocity * math.sin(angle) / w + state.acceleration * 2.0 * half * half / (w * w)
+    )
