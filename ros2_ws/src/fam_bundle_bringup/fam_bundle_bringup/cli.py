@@ -25,7 +25,8 @@ from fam_bundle_bringup.experiment import (
 from fam_bundle_bringup.one_line_parser import Parser
 from fam_bundle_bringup.rig_commands import NAMES as RIG_COMMANDS
 from fam_bundle_bringup.rig_commands import add_rig_commands, run_rig_command
-from fam_bundle_model.parameters import PREDICTORS, SCHEMES, Configuration
+from fam_bundle_model.parameters import KINDS, PREDICTORS, SCHEMES, Configuration
+from fam_bundle_model.reference_file import read_samples
 from fam_bundle_model.schema import ConfigurationError
 
 NAMED = 3  # of what a bag misses
@@ -111,7 +112,12 @@ def _add_experiment(commands: Any) -> None:
         '--record', action='store_true', help='record all topics to DIR/bag (rosbag2, MCAP)'
     )
     add_bridge_options(experiment)
-    experiment.add_argument('--reference', metavar='sine', help='waveform of the strain reference')
+    experiment.add_argument(
+        '--reference',
+        metavar='KIND|FILE.csv',
+        help=f'strain reference: {", ".join(KINDS)}; or a file with the header time,strain, at '
+        'whose first strain the run begins',
+    )
     experiment.add_argument('--amplitude', metavar='STRAIN', help='half of its peak strain')
     experiment.add_argument('--frequency', metavar='HZ', help='its frequency')
     experiment.add_argument('--cycles', metavar='N', help='how many cycles to run')
@@ -157,19 +163,32 @@ def _argument(convert: Callable[[str], Any]) -> Callable[[str], Any]:
     return converted
 
 
+def reference_of(text: str | None) -> dict[str, dict[str, Any]]:
+    """Return the changes that ``--reference`` asks for: a kind, or the samples in a file.
+
+    Raises ConfigurationError when the file holds none.
+    """
+    if text is None:
+        return {}
+    if not text.lower().endswith('.csv'):
+        return {'reference': {'kind': text}}
+    times, strains = read_samples(Path(text))
+    samples = {'kind': 'samples', 'times': times, 'strains': strains}
+    return {'reference': samples, 'simulation': {'initial_strain': strains[0]}}
+
+
 def changes_of(options: argparse.Namespace) -> Mapping[str, Mapping[str, Any]]:
     """Return the configuration changes that the options ask for."""
     wanted = {
         ('recruitment', 'scheme'): options.scheme,
         ('recruitment', 'predictor'): options.predictor,
         ('recruitment', 'upshift_threshold'): options.threshold,
-        ('reference', 'kind'): options.reference,
         ('reference', 'amplitude'): options.amplitude,
         ('reference', 'frequency'): options.frequency,
         ('reference', 'cycles'): options.cycles,
         ('bridge', 'backend'): options.backend,
     }
-    changes: dict[str, dict[str, Any]] = {}
+    changes = reference_of(options.reference)
     for (group, name), value in wanted.items():
         if value is not None:
             changes.setdefault(group, {})[name] = value
@@ -288,6 +307,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise ConfigurationError(f'--record: {options.out}/bag exists: name another --out')
         config = options.config or default_configuration()
         configuration = checked_configuration(config, changes)
+        if getattr(options, 'pace', None) == 'offline' and configuration.reference.kind == 'topic':
+            raise ConfigurationError('reference.kind = topic: --pace offline has no topics')
         if config.resolve() == (options.out / 'parameters.yaml').resolve():
             raise ConfigurationError(f'--out {options.out}: would overwrite {config}')
         prepare_folder(options.out, results)

@@ -28,7 +28,7 @@ LARGEST_RUN = 20_000_000  # ticks that a trace in memory can hold
 
 
 class Result(NamedTuple):
-    """Trace of a run and its metrics over the last cycle."""
+    """Trace of a run and its metrics over ``last_cycle``."""
 
     trace: Trace
     metrics: dict[str, Any]
@@ -56,27 +56,41 @@ def checked_configuration(
 def check_feasible(configuration: Configuration) -> None:
     """Raise ConfigurationError, naming parameter, value and bound, unless the rig can run it."""
     check_reachable(configuration, motor_units(configuration))
-    ticks, cycles = configuration.ticks(), configuration.reference.cycles
-    if ticks < 2 * cycles:
+    check_length(configuration)
+    return configuration
+
+
+def check_length(configuration: Configuration) -> None:
+    """Raise ConfigurationError where a run has too few ticks for its reference, or too many."""
+    period, ticks = configuration.simulation.period, configuration.ticks()
+    reference = configuration.reference
+    highest = max(reference.highest_frequency(), 1.0 / configuration.duration())
+    if period > 0.5 / highest:
         raise ConfigurationError(
-            f'simulation.period = {configuration.simulation.period:g} s: must be <= '
-            f'{0.5 / configuration.reference.frequency:g} s, half a cycle of the reference'
+            f'simulation.period = {period:g} s: must be <= {0.5 / highest:g} s, half a cycle of '
+            'the reference'
         )
     if ticks > LARGEST_RUN:
+        given = f'reference.cycles = {reference.cycles}'
+        bound = f'{LARGEST_RUN * reference.cycles // ticks}'
+        if reference.kind == 'samples':
+            given = f'reference.times[{len(reference.times) - 1}] = {reference.times[-1]:g} s'
+            bound = f'{LARGEST_RUN * period:g} s'
         raise ConfigurationError(
-            f'reference.cycles = {cycles}: must be <= {LARGEST_RUN * cycles // ticks}, for a '
-            f'trace holds at most {LARGEST_RUN} ticks'
+            f'{given}: must be <= {bound}, for a trace holds at most {LARGEST_RUN} ticks'
         )
 
 
 def last_cycle(configuration: Configuration) -> tuple[float, float]:
-    """Return start and end of the last cycle in s: the settled one, if there are two."""
-    end = configuration.duration()
-    return end - 1.0 / configuration.reference.frequency, end
+    """Return start and end of the last cycle in s: the settled one, if there are two.
+
+    The whole run where the reference does not repeat.
+    """
+    return configuration.cycles()[-1]
 
 
 def measure_tracking(configuration: Configuration, trace: Trace) -> Tracking:
-    """Return IAE and largest error over the last cycle."""
+    """Return IAE and largest error over the last cycle, or the whole run if nothing repeats."""
     return tracking(trace, *last_cycle(configuration))
 
 

@@ -16,11 +16,11 @@ from fam_bundle_control.recruitment import (
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.lag_table import LagTable
 from fam_bundle_model.parameters import load_configuration
-from fam_bundle_model.reference import Reference
+from fam_bundle_model.reference import still
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 DT = 0.001
-STILL = Reference(0.0, 1.0)
+STILL = still()
 
 
 @pytest.fixture(scope='session')

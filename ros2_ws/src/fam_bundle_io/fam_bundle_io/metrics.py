@@ -118,15 +118,12 @@ def valleys(reference: npt.NDArray[np.float64]) -> list[int]:
 def whole_cycles(trace: Trace, configuration: Configuration | None = None) -> list[Window]:
     """Return the cycles of the reference that the trace holds from their first tick to the last.
 
+    A reference that does not repeat is one cycle, the whole run.
     Where no ``configuration`` tells them they are taken from valley to valley of the reference.
     """
     time, step = trace['time'], float(steps(trace)[-1])
     if configuration is not None:
-        frequency = configuration.reference.frequency
-        cycles = [
-            Window(k / frequency, (k + 1) / frequency)
-            for k in range(configuration.reference.cycles)
-        ]
+        cycles = [Window(*cycle) for cycle in configuration.cycles()]
     else:
         edges = [*time.tolist(), float(time[-1]) + step]
         reference = trace['strain_reference']

@@ -10,9 +10,17 @@ from fam_bundle_model import fam
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.fam import FamLaw, fam_law, value_of
 from fam_bundle_model.parameters import GRAVITY, Configuration
+from fam_bundle_model.reference import (
+    Reference,
+    reference_law,
+    strain_range,
+    strain_reference,
+)
 from fam_bundle_model.schema import ConfigurationError
 
 HIGHEST_STRAIN = 0.5  # the upper end of the search in strain
+ROUNDING = 1e-12  # of a strain
+START_MISMATCH = 1e-3  # strain by which a run may begin beside its reference
 TABLE_PRESSURE_RATIO = 2.0  # tables reach to this multiple of the nominal pressure
 
 
@@ -118,6 +126,37 @@ def balancing_pressure(
     return 0.5 * (low + high)
 
 
+def reachable(configuration: Configuration, units: tuple[MotorUnit, ...]) -> tuple[float, float]:
+    """Return the lowest and the highest strain at which the bundle can hold its load.
+
+    All motor units open to the tank, and all at the nominal source pressure.
+    """
+    weight = configuration.load.mass * GRAVITY
+    nominal = configuration.source.nominal_pressure
+    low = modelled_strain(units, len(units), 0.0, weight)
+    return low, modelled_strain(units, len(units), nominal, weight)
+
+
+def check_within_reach(
+    law: Reference, name: str, reach: tuple[float, float], pressure: float
+) -> None:
+    """Raise ConfigurationError where a trajectory ``name`` leaves what can be held.
+
+    ``reach`` is as from ``reachable``, ``pressure`` in Pa that of all motor units for the highest.
+    """
+    lowest, highest = strain_range(law)
+    if highest > reach[1] + ROUNDING:
+        raise ConfigurationError(
+            f'{name}: its peak strain {highest:g} must be <= {reach[1]:.4g}, what all motor '
+            f'units at {pressure:g} Pa can hold'
+        )
+    if lowest < min(reach[0], 0.0) - ROUNDING:
+        raise ConfigurationError(
+            f'{name}: its lowest strain {lowest:g} must be >= {min(reach[0], 0.0):.4g}, where '
+            'the load hangs on the empty bundle'
+        )
+
+
 def check_reachable(configuration: Configuration, units: tuple[MotorUnit, ...]) -> None:
     """Raise ConfigurationError where the load cannot be lifted or the reference not reached."""
     weight = configuration.load.mass * GRAVITY
@@ -128,17 +167,21 @@ def check_reachable(configuration: Configuration, units: tuple[MotorUnit, ...]) 
             f'load.mass = {configuration.load.mass:g} kg: can never be lifted; all motor units '
             f'at {nominal:g} Pa hold at most {strongest / GRAVITY:.4g} kg'
         )
-    reach = modelled_strain(units, len(units), nominal, weight)
-    peak = 2.0 * configuration.reference.amplitude
-    if peak > reach:
-        raise ConfigurationError(
-            f'reference.amplitude = {configuration.reference.amplitude:g}: its peak strain '
-            f'{peak:g} must be <= {reach:.4g}, what all motor units at {nominal:g} Pa can hold'
-        )
+    law, reference = reference_law(configuration.reference), configuration.reference
+    name = f'reference.amplitude = {reference.amplitude:g}'
+    if reference.kind in ('samples', 'topic'):
+        name = 'reference.strains'
+    check_within_reach(law, name, reachable(configuration, units), nominal)
     start = configuration.simulation.initial_strain
     if state_force(units, 1, nominal, start) < weight:
         limit = modelled_strain(units, 1, nominal, weight)
         raise ConfigurationError(
             f'simulation.initial_strain = {start:g}: must be <= {limit:.4g}, what the first '
             f'motor unit at {nominal:g} Pa can hold'
+        )
+    first = strain_reference(law, 0.0)
+    if abs(first - start) > START_MISMATCH:
+        raise ConfigurationError(
+            f'simulation.initial_strain = {start:g}: must be within {START_MISMATCH:g} of '
+            f'{first:g}, where the reference begins'
         )

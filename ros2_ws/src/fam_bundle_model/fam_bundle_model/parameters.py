@@ -8,8 +8,10 @@ loop and single nodes (``--ros-args --params-file``). SI units throughout.
 import dataclasses
 import hashlib
 import json
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from fam_bundle_model.schema import (
     number,
     per_unit,
     positive,
+    series,
     unknown,
     word,
 )
@@ -164,6 +167,14 @@ class RecruitmentParameters:
         'how the strain is expected to go on', PREDICTORS, default='constant_rate'
     )
     prediction_horizon: float = number(
+    reserve: float = number(
+        'Pa',
+        'source pressure kept in reserve by the prediction: more recruits earlier and tracks '
+        'better, less recruits later and spends less oil',
+        default=0.0,
+        minimum=-5e5,
+        maximum=5e5,
+    )
         's',
         "how far ahead the predictor's error is measured",
         default=0.3,
@@ -212,12 +223,71 @@ class LagTableParameters:
 
 @dataclass(frozen=True)
 class ReferenceParameters:
-    """The strain to be tracked: amplitude x (1 - cos(2 pi frequency t))."""
+    """The strain to be tracked: which kind of waveform, and what the kinds take."""
 
-    kind: str = choice('waveform', ('sine',))
+    kind: str = choice('waveform', KINDS)
     amplitude: float = number('', 'half of the peak strain', minimum=0.0, maximum=0.15)
     frequency: float = number('Hz', 'cycles per second', minimum=1e-3, maximum=10.0)
-    cycles: int = integer('cycles in a run', 1, 100_000)
+    cycles: int = integer('cycles in a run; sets the duration of all but samples', 1, 100_000)
+    final_frequency: float = number(
+        'Hz', 'frequency at the end of a chirp', default=0.3, minimum=1e-3, maximum=10.0
+    )
+    multiples: tuple[float, ...] = series(
+        '',
+        'frequency of each of the sum of sines over frequency',
+        default=(1.0, 1.7, 2.9),
+        minimum=1e-3,
+        maximum=1000.0,
+    )
+    weights: tuple[float, ...] = series(
+        '',
+        'weight of each of these sines in the amplitude; a single one serves all',
+        default=(0.6, 0.25, 0.15),
+        minimum=0.0,
+        exclusive=True,
+    )
+    levels: tuple[float, ...] = series(
+        '',
+        'strains of steps and minimum jerk over the peak strain, in equal parts of a cycle',
+        default=(0.5, 1.0, 0.5, 0.0),
+        minimum=0.0,
+        maximum=1.0,
+    )
+    strain_rate: float = positive(
+        '1/s', 'largest rate of steps, of a live topic and on the way to a goal', default=0.1
+    )
+    strain_acceleration: float = positive(
+        '1/s^2', 'largest acceleration of steps and on the way to a goal', default=1.0
+    )
+    seed: int = integer('seed of the random waypoints', 0, 2**31 - 1, default=0)
+    times: tuple[float, ...] = series(
+        's', 'times of the samples', default=(0.0,), minimum=0.0, maximum=1e6
+    )
+    strains: tuple[float, ...] = series(
+        '',
+        'strains of the samples; a live topic begins at the first',
+        default=(0.0,),
+        minimum=-0.1,
+        maximum=0.3,
+    )
+
+    def is_cyclic(self) -> bool:
+        """Return whether the waveform repeats itself with each cycle."""
+        if self.kind == 'sum_of_sines':
+            return all(float(m).is_integer() for m in self.multiples)
+        return self.kind in CYCLIC
+
+    def duration(self) -> float:
+        """Return the length in s."""
+        return self.times[-1] if self.kind == 'samples' else self.cycles / self.frequency
+
+    def highest_frequency(self) -> float:
+        """Return the highest frequency in it in Hz; zero where it has none."""
+        if self.kind == 'sum_of_sines':
+            return self.frequency * max(self.multiples)
+        if self.kind == 'chirp':
+            return max(self.frequency, self.final_frequency)
+        return 0.0 if self.kind in ('samples', 'topic') else self.frequency
 
 
 @dataclass(frozen=True)
@@ -305,7 +375,14 @@ class Configuration:
 
     def duration(self) -> float:
         """Return the length of the run in s."""
-        return self.reference.cycles / self.reference.frequency
+        return self.reference.duration()
+
+    def cycles(self) -> list[tuple[float, float]]:
+        """Return start and end in s of each cycle; the whole run where nothing repeats."""
+        if not self.reference.is_cyclic():
+            return [(0.0, self.duration())]
+        frequency = self.reference.frequency
+        return [(k / frequency, (k + 1) / frequency) for k in range(self.reference.cycles)]
 
     def period_ns(self) -> int:
         """Return the time between two ticks in ns: stamps count in whole nanoseconds."""
@@ -373,6 +450,8 @@ def check_fam(fam: FamParameters) -> None:
             f'fam.length = {list(fam.length)} m: must be equal, for all FAMs share one strain'
         )
 
+    if configuration.reference is not None:
+        check_reference(configuration.reference)
 
 def check_lengths(
     group: str, values: FamParameters | PressureLoopParameters, fam: FamParameters
@@ -391,6 +470,56 @@ def check_recruitment(recruitment: RecruitmentParameters) -> None:
     """Raise ConfigurationError where a unit would be released as soon as it is recruited."""
     if recruitment.downshift_threshold >= recruitment.upshift_threshold:
         raise ConfigurationError(
+def check_reference(reference: ReferenceParameters) -> None:
+    """Raise ConfigurationError where the parameters of its kind do not fit together."""
+    p = reference
+    if p.kind == 'sum_of_sines' and len(p.weights) not in (1, len(p.multiples)):
+        raise ConfigurationError(
+            f'reference.weights: {len(p.weights)} values for {len(p.multiples)} multiples; '
+            f'must be 1 or {len(p.multiples)}'
+        )
+    if p.kind == 'samples':
+        check_samples(p)
+    if p.kind == 'steps':
+        share = 1.0 / (p.frequency * len(p.levels))
+        moves = [abs(b - a) for a, b in zip((p.levels[-1], *p.levels[:-1]), p.levels, strict=True)]
+        largest = 2.0 * p.amplitude * max(moves)
+        taken = step_time(largest, p.strain_rate, p.strain_acceleration)
+        if taken > share:
+            raise ConfigurationError(
+                f'reference.levels: a step of {largest:g} within reference.strain_rate = '
+                f'{p.strain_rate:g} 1/s and reference.strain_acceleration = '
+                f'{p.strain_acceleration:g} 1/s^2 takes {taken:.3g} s: must be <= {share:g} s, '
+                "a level's part of a cycle"
+            )
+
+
+def check_samples(reference: ReferenceParameters) -> None:
+    """Raise ConfigurationError unless there are two samples or more in the order of time."""
+    times, strains = reference.times, reference.strains
+    if len(times) != len(strains):
+        raise ConfigurationError(
+            f'reference.strains: {len(strains)} values for {len(times)} times; '
+            f'must be {len(times)}'
+        )
+    if not 2 <= len(times) <= MOST_SAMPLES:
+        raise ConfigurationError(
+            f'reference.times: {len(times)} samples; must be >= 2 and <= {MOST_SAMPLES}'
+        )
+    for i, (before, time) in enumerate(pairwise(times), 1):
+        if time <= before:
+            raise ConfigurationError(
+                f'reference.times[{i}] = {time:g} s: must be > {before:g} s, the one before'
+            )
+
+
+def step_time(distance: float, rate: float, acceleration: float) -> float:
+    """Return the shortest time in s from rest to rest over ``distance`` within both limits."""
+    if distance < rate * rate / acceleration:
+        return 2.0 * math.sqrt(distance / acceleration)
+    return distance / rate + rate / acceleration
+
+
             f'recruitment.downshift_threshold = {recruitment.downshift_threshold:g}: must be < '
             f'recruitment.upshift_threshold = {recruitment.upshift_threshold:g}'
         )

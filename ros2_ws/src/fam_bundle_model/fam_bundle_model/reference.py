@@ -1,27 +1,313 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The strain to be tracked, as a function of time."""
+"""The strain to be tracked, as a function of time: every kind of waveform is one law.
+
+A law is sines over polynomials. Before it begins it is at rest at its first strain, after its end
+at its last one. Harmonic kinds are ``a (1 - cos(phase))``, which begins at rest at zero; all
+others are polynomials of time of at most fifth degree, one piece after another.
+"""
 
 import math
+import random
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
 from fam_bundle_model.compile import compiled
-from fam_bundle_model.parameters import ReferenceParameters
+from fam_bundle_model.parameters import ReferenceParameters, step_time
+
+Array = npt.NDArray[np.float64]
+
+ORDER = 6  # coefficients of a piece
+FINENESS = 33  # points at which a piece is looked at for its extremes
+LONGER = 1.1  # what is too fast takes so much longer at the next try
 
 
 class Reference(NamedTuple):
-    """The trajectory: half of the peak strain, and its frequency in Hz."""
+    """A trajectory; what lies before time zero of its own is the way to its beginning.
 
-    amplitude: float
-    frequency: float
+    ``start`` is that zero (s); from ``end`` (s after it) on its strain is held. The polynomials
+    begin anew each ``cycle`` (s; infinite: never). ``sines`` holds a row of amplitude, frequency
+    (Hz) and rise of the frequency (Hz/s) for each; ``breaks`` where each polynomial begins (s
+    after ``start``), and ``coefficients`` its row of six, of the rising powers of the time since.
+    """
 
-
-def reference_law(parameters: ReferenceParameters) -> Reference:
-    """Return the trajectory of ``parameters``."""
-    return Reference(parameters.amplitude, parameters.frequency)
+    start: float
+    end: float
+    cycle: float
+    sines: Array
+    breaks: Array
+    coefficients: Array
 
 
 @compiled
 def strain_reference(law: Reference, time: float) -> float:
-    """Return the reference strain at ``time`` s: amplitude x (1 - cos(2 pi frequency t))."""
-    phase = 2.0 * math.pi * law.frequency * time
-    return law.amplitude * (1.0 - math.cos(phase))
+    """Return the reference strain at ``time`` s."""
+    since = min(max(time - law.start, law.breaks[0]), law.end)
+    within = since % law.cycle if since > 0.0 else since
+    piece = np.searchsorted(law.breaks, within, side='right') - 1
+    passed = within - law.breaks[piece]
+    strain = 0.0
+    for power in range(law.coefficients.shape[1] - 1, -1, -1):
+        strain = strain * passed + law.coefficients[piece, power]
+    if since > 0.0:
+        for k in range(law.sines.shape[0]):
+            frequency, sweep = law.sines[k, 1], law.sines[k, 2]
+            phase = 2.0 * math.pi * frequency * since + math.pi * sweep * since * since
+            strain += law.sines[k, 0] * (1.0 - math.cos(phase))
+    return strain
+
+
+def reference_law(parameters: ReferenceParameters) -> Reference:
+    """Return the trajectory of ``parameters``, which begins at 0 s."""
+    return _KINDS[parameters.kind](parameters)
+
+
+def still(strain: float = 0.0) -> Reference:
+    """Return the trajectory that stays at ``strain``."""
+    return _pieces([0.0], [[strain]], 0.0)
+
+
+# ---- The kinds ----
+
+
+def _sines(parameters: ReferenceParameters, rows: Sequence[Sequence[float]]) -> Reference:
+    law = still()
+    return law._replace(end=parameters.duration(), sines=np.array(rows, dtype=np.float64))
+
+
+def _sine(p: ReferenceParameters) -> Reference:
+    return _sines(p, [(p.amplitude, p.frequency, 0.0)])
+
+
+def _sum_of_sines(p: ReferenceParameters) -> Reference:
+    """Weights share the amplitude: the peak strain is at most twice that."""
+    weights = p.weights if len(p.weights) > 1 else p.weights * len(p.multiples)
+    scale = p.amplitude / sum(weights)
+    pairs = zip(p.multiples, weights, strict=True)
+    return _sines(p, [(scale * w, p.frequency * m, 0.0) for m, w in pairs])
+
+
+def _chirp(p: ReferenceParameters) -> Reference:
+    """The frequency rises or falls evenly over the whole duration."""
+    sweep = (p.final_frequency - p.frequency) / p.duration()
+    return _sines(p, [(p.amplitude, p.frequency, sweep)])
+
+
+def _ramp(p: ReferenceParameters) -> Reference:
+    """Up in half a cycle, as fast on average as the sine, and there it stays."""
+    half, peak = 0.5 / p.frequency, 2.0 * p.amplitude
+    return _pieces([0.0, half], [[0.0, peak / half], [peak]], p.duration())
+
+
+def _trapezoid(p: ReferenceParameters) -> Reference:
+    """A quarter of a cycle each: up, held, down, held."""
+    quarter, peak = 0.25 / p.frequency, 2.0 * p.amplitude
+    rows = [[0.0, peak / quarter], [peak], [peak, -peak / quarter], [0.0]]
+    breaks = [k * quarter for k in range(4)]
+    return _pieces(breaks, rows, p.duration(), 1.0 / p.frequency)
+
+
+def _levels(p: ReferenceParameters) -> tuple[float, list[tuple[float, float]]]:
+    """Return the time of each level, and from where to where each step goes."""
+    strains = [2.0 * p.amplitude * level for level in p.levels]
+    return 1.0 / (p.frequency * len(strains)), [*pairwise((strains[-1], *strains))]
+
+
+def _steps(p: ReferenceParameters) -> Reference:
+    """Each as fast as the limits on rate and acceleration allow: trapezoids of strain rate."""
+    share, moves = _levels(p)
+    breaks, rows = [], []
+    for k, (start, stop) in enumerate(moves):
+        distance, sign = abs(stop - start), math.copysign(1.0, stop - start)
+        rise = min(
+            p.strain_rate / p.strain_acceleration, math.sqrt(distance / p.strain_acceleration)
+        )
+        taken = step_time(distance, p.strain_rate, p.strain_acceleration)
+        rate, bend = sign * rise * p.strain_acceleration, sign * 0.5 * p.strain_acceleration
+        near = bend * rise * rise
+        for offset, row in (
+            (0.0, [start, 0.0, bend]),
+            (rise, [start + near, rate]),
+            (taken - rise, [stop - near, rate, -bend]),
+            (taken, [stop]),
+        ):
+            breaks.append(k * share + offset)
+            rows.append(row)
+    return _pieces(breaks, rows, p.duration(), 1.0 / p.frequency)
+
+
+def _minimum_jerk(p: ReferenceParameters) -> Reference:
+    """From rest to rest: of all ways the one with the least integral of the squared jerk.
+
+    Flash and Hogan, The Coordination of Arm Movements, J. Neurosci. 5(7), 1985.
+    """
+    share, moves = _levels(p)
+    rows = [quintic(start, 0.0, stop, 0.0, share) for start, stop in moves]
+    breaks = [k * share for k in range(len(rows))]
+    return _pieces(breaks, rows, p.duration(), 1.0 / p.frequency)
+
+
+def _random(p: ReferenceParameters) -> Reference:
+    """Waypoints about half a cycle apart, anywhere up to the peak strain; seeded."""
+    dice = random.Random(p.seed)  # the same on every machine
+    parts = [0.5 + dice.random() for _ in range(2 * p.cycles)]
+    times = [0.0, *(np.cumsum(parts) * (p.duration() / sum(parts))).tolist()]
+    strains = [0.0, *(2.0 * p.amplitude * dice.random() for _ in parts)]
+    return smooth(times, strains)
+
+
+def _samples(p: ReferenceParameters) -> Reference:
+    return smooth(p.times, p.strains)
+
+
+def _topic(p: ReferenceParameters) -> Reference:
+    """The first strain is held; what comes on the topic takes its place."""
+    return still(p.strains[0])._replace(end=p.duration())
+
+
+_KINDS: dict[str, Callable[[ReferenceParameters], Reference]] = {
+    'sine': _sine,
+    'trapezoid': _trapezoid,
+    'steps': _steps,
+    'minimum_jerk': _minimum_jerk,
+    'sum_of_sines': _sum_of_sines,
+    'chirp': _chirp,
+    'ramp': _ramp,
+    'random': _random,
+    'samples': _samples,
+    'topic': _topic,
+}
+
+
+# ---- Pieces ----
+
+
+def _pieces(
+    breaks: Sequence[float],
+    rows: Sequence[Sequence[float]],
+    end: float,
+    cycle: float = math.inf,
+) -> Reference:
+    coefficients = np.zeros((len(rows), ORDER))
+    for full, row in zip(coefficients, rows, strict=True):
+        full[: len(row)] = row
+    return Reference(0.0, end, cycle, np.zeros((0, 3)), np.array(breaks, float), coefficients)
+
+
+def quintic(
+    start: float, rate: float, stop: float, final_rate: float, taken: float
+) -> list[float]:
+    """Return the coefficients of the way of least jerk that takes ``taken`` s.
+
+    From strain ``start`` to ``stop`` at the strain rates ``rate`` and ``final_rate`` (1/s) without
+    acceleration at either end.
+    """
+    left = stop - start - rate * taken
+    gain = (final_rate - rate) * taken
+    third, fourth, fifth = 10 * left - 4 * gain, 7 * gain - 15 * left, 6 * left - 3 * gain
+    return [start, rate, 0.0, third / taken**3, fourth / taken**4, fifth / taken**5]
+
+
+def smooth(times: Sequence[float], strains: Sequence[float]) -> Reference:
+    """Return the trajectory through ``strains`` at rising ``times`` (s), from rest to rest.
+
+    Strain rate and acceleration are continuous, and between two points it rises or falls
+    throughout. Each point is passed without acceleration, at the smaller of the mean rates beside
+    it, or at rest where these differ in sign. The rate of a piece from 0 to 1 in unit time, with
+    rates a and b at its ends, has the Bernstein coefficients a, a, 5 - 2 a - 2 b, b, b: none is
+    negative, for a and b are at most 1.
+    """
+    slopes = np.diff(strains) / np.diff(times)
+    before, after = slopes[:-1], slopes[1:]
+    passing = np.where(np.abs(before) < np.abs(after), before, after)
+    passing[before * after <= 0.0] = 0.0
+    rates = [0.0, *passing.tolist(), 0.0]
+    rows = [
+        quintic(strains[k], rates[k], strains[k + 1], rates[k + 1], times[k + 1] - times[k])
+        for k in range(len(times) - 1)
+    ]
+    breaks = np.array(times, float)[:-1] - times[0]
+    law = _pieces(breaks.tolist(), rows, times[-1] - times[0])
+    return law._replace(start=times[0])
+
+
+# ---- From one trajectory to the next ----
+
+
+def rate_of(law: Reference, time: float) -> float:
+    """Return the strain rate in 1/s at ``time`` s; zero where the strain is held."""
+    since = time - law.start
+    if not law.breaks[0] <= since < law.end:
+        return 0.0
+    within = since % law.cycle if since > 0.0 else since
+    piece = int(np.searchsorted(law.breaks, within, side='right')) - 1
+    slope = np.polynomial.polynomial.polyder(law.coefficients[piece])
+    rate = float(np.polynomial.polynomial.polyval(within - law.breaks[piece], slope))
+    if since > 0.0:
+        for amplitude, frequency, sweep in law.sines.tolist():
+            speed = 2.0 * math.pi * (frequency + sweep * since)
+            phase = 2.0 * math.pi * frequency * since + math.pi * sweep * since * since
+            rate += amplitude * speed * math.sin(phase)
+    return rate
+
+
+def after(
+    before: Reference, time: float, wanted: Reference, rate: float, acceleration: float
+) -> Reference:
+    """Return ``wanted``, begun as soon as a smooth way leads to it from ``before`` at ``time`` s.
+
+    The way goes on from the strain and the strain rate of that time, ends at rest, and keeps to
+    ``rate`` (1/s; or to the present one where that is higher) and ``acceleration`` (1/s^2).
+    """
+    start, stop = strain_reference(before, time), strain_reference(wanted, wanted.start)
+    present = rate_of(before, time)
+    if start == stop and present == 0.0:
+        return wanted._replace(start=time)
+    taken = max(step_time(abs(stop - start), rate, acceleration), abs(present) / acceleration)
+    while True:
+        way = np.array(quintic(start, present, stop, 0.0, taken))
+        fastest = _largest(np.polynomial.polynomial.polyder(way), taken)
+        hardest = _largest(np.polynomial.polynomial.polyder(way, 2), taken)
+        if fastest <= max(rate, abs(present)) and hardest <= acceleration:
+            break
+        taken *= LONGER
+    return _preceded(wanted, time, taken, way)
+
+
+def slewed(before: Reference, time: float, strain: float, rate: float) -> Reference:
+    """Return the trajectory from ``before`` at ``time`` s straight to ``strain`` at ``rate``."""
+    start = strain_reference(before, time)
+    if start == strain:
+        return still(strain)._replace(start=time)
+    way = np.zeros(ORDER)
+    way[:2] = start, math.copysign(rate, strain - start)
+    return _preceded(still(strain), time, abs(strain - start) / rate, way)
+
+
+def strain_range(law: Reference) -> tuple[float, float]:
+    """Return the lowest and the highest strain of a trajectory, its sines at their widest."""
+    last = min(law.cycle, law.end)
+    lengths = np.diff(law.breaks, append=max(last, law.breaks[-1]))
+    passed = lengths[:, None] * np.linspace(0.0, 1.0, FINENESS)
+    strains = np.zeros_like(passed)
+    for column in law.coefficients.T[::-1]:
+        strains = strains * passed + column[:, None]
+    widest = np.where(law.breaks >= 0.0, 2.0 * law.sines[:, 0].sum(), 0.0)
+    return float(strains.min()), float((strains.max(axis=1) + widest).max())
+
+
+def _preceded(wanted: Reference, time: float, taken: float, way: Array) -> Reference:
+    """Return ``wanted`` after a ``way`` that begins at ``time`` and takes so many seconds."""
+    return wanted._replace(
+        start=time + taken,
+        breaks=np.concatenate(([-taken], wanted.breaks)),
+        coefficients=np.vstack((way, wanted.coefficients)),
+    )
+
+
+def _largest(coefficients: Array, until: float) -> float:
+    times = np.linspace(0.0, until, FINENESS)
+    return float(np.abs(np.polynomial.polynomial.polyval(times, coefficients)).max())

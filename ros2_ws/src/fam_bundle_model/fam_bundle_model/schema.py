@@ -2,8 +2,8 @@
 """How a parameter is declared: type, unit, range and one sentence, stated once.
 
 A group is a frozen dataclass whose fields are made by ``number``, ``integer``, ``choice``,
-``flag``, ``word`` or ``per_unit``. Validation, the YAML loader, ROS parameter descriptors and the
-reference page all read the same declaration.
+``flag``, ``word``, ``per_unit`` or ``series``. Validation, the YAML loader, ROS parameter
+descriptors and the reference page all read the same declaration.
 """
 
 import dataclasses
@@ -25,7 +25,8 @@ class Declaration:
 
     ``unit`` is an SI unit or empty; ``minimum`` and ``maximum`` bound the value, and
     ``exclusive`` says that the minimum itself is not allowed. ``kind`` is ``float``, ``int``,
-    ``bool`` or ``str``; ``array`` marks one value per motor unit (a single value serves all).
+    ``bool`` or ``str``; ``array`` marks one value per motor unit (a single value serves all), or
+    with ``series`` a row of its own length.
     """
 
     kind: type
@@ -36,6 +37,7 @@ class Declaration:
     exclusive: bool = False
     choices: tuple[str, ...] = ()
     array: bool = False
+    series: bool = False
 
     def is_free_text(self) -> bool:
         """Return whether any text will do that is not blank."""
@@ -65,7 +67,8 @@ class Declaration:
             return self._convert_one(name, value)
         values = value if isinstance(value, list | tuple) else [value]
         if len(values) == 0:
-            raise ConfigurationError(f'{name} = []: must hold a value for each motor unit')
+            wanted = 'at least one value' if self.series else 'a value for each motor unit'
+            raise ConfigurationError(f'{name} = []: must hold {wanted}')
         names = [name] if len(values) == 1 else [f'{name}[{i}]' for i in range(len(values))]
         return tuple(self._convert_one(n, v) for n, v in zip(names, values, strict=True))
 
@@ -137,6 +140,12 @@ def flag(text: str, *, default: bool) -> Any:
 def per_unit(kind: type, unit: str, text: str, **bounds: Any) -> Any:
     """Declare one value for each motor unit, or a single one for all."""
     return _field(Declaration(kind, unit, text, array=True, **bounds), None)
+
+
+def series(unit: str, text: str, *, default: tuple[float, ...], **bounds: Any) -> Any:
+    """Declare a row of one or more floats in ``unit``."""
+    declaration = Declaration(float, unit, text, array=True, series=True, **bounds)
+    return _field(declaration, default)
 
 
 def declarations(group: type) -> dict[str, Declaration]:

@@ -137,10 +137,45 @@ def test_a_reference_beyond_reach_is_refused(change, configuration, units):
     assert f'must be <= {reach:.4g}' in message
 
 
+def held_at(change, strain):
+    """Return a configuration that begins at ``strain`` and stays there."""
+    simulation = change('simulation', initial_strain=strain).simulation
+    held = change('reference', kind='samples', times=(0.0, 1.0), strains=(strain, strain))
+    return dataclasses.replace(held, simulation=simulation)
+
+
 def test_a_start_that_the_first_unit_cannot_hold_is_refused(change, configuration, units):
     weight = configuration.load.mass * GRAVITY
     limit = bundle.modelled_strain(units, 1, configuration.source.nominal_pressure, weight)
-    bundle.check_reachable(change('simulation', initial_strain=limit - 1e-4), units)
-    message = complaint(change('simulation', initial_strain=limit + 1e-3), units)
+    bundle.check_reachable(held_at(change, limit - 1e-4), units)
+    message = complaint(held_at(change, limit + 1e-3), units)
     assert message.startswith(f'simulation.initial_strain = {limit + 1e-3:g}: ')
     assert f'must be <= {limit:.4g}' in message
+
+
+def test_a_start_beside_the_reference_is_refused(change, units):
+    """The reference would begin with a jump."""
+    message = complaint(change('simulation', initial_strain=0.02), units)
+    assert message == (
+        'simulation.initial_strain = 0.02: must be within 0.001 of 0, where the reference begins'
+    )
+
+
+@pytest.mark.parametrize('kind', ['sine', 'trapezoid', 'steps', 'minimum_jerk', 'chirp', 'ramp'])
+def test_every_kind_is_refused_when_its_peak_is_out_of_reach(kind, change, configuration, units):
+    highest = bundle.reachable(configuration, units)[1]
+    bundle.check_reachable(change('reference', kind=kind, amplitude=0.499 * highest), units)
+    message = complaint(change('reference', kind=kind, amplitude=0.501 * highest), units)
+    assert f'its peak strain {1.002 * highest:g} must be <= {highest:.4g}' in message
+
+
+def test_a_load_hangs_at_the_lowest_strain(change, configuration, units):
+    """Nothing pushes the bundle longer than it is under the load without any pressure."""
+    lowest = bundle.reachable(configuration, units)[0]
+    weight = configuration.load.mass * GRAVITY
+    assert bundle.state_force(units, 2, 0.0, lowest) == pytest.approx(weight)
+    samples = {'kind': 'samples', 'times': (0.0, 1.0, 2.0)}
+    within = change('reference', **samples, strains=(0.0, 0.999 * lowest, 0.0))
+    bundle.check_reachable(within, units)
+    message = complaint(change('reference', **samples, strains=(0.0, 1.001 * lowest, 0.0)), units)
+    assert message.startswith(f'reference.strains: its lowest strain {1.001 * lowest:g} ')

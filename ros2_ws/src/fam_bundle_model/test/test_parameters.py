@@ -26,7 +26,7 @@ DIMENSIONLESS = {
     'sensors': 'strain_noise strain_resolution seed',
     'simulation': 'substeps initial_strain',
     'lag_table': 'source_points deslack_points minimum_source',
-    'reference': 'kind amplitude cycles',
+    'reference': 'kind amplitude cycles multiples weights levels seed strains',
     'run': 'pace listeners',
     'process': 'executor priority cpu_mask lock_memory freeze_garbage',
     'bridge': 'backend hardware start answer_share',
