@@ -32,6 +32,9 @@ from fam_bundle_model.schema import (
 
 PACES = ('lockstep', 'realtime')
 SCHEMES = ('baseline', 'lag', 'pressure', 'lag_pressure')
+CYCLIC = ('sine', 'trapezoid', 'steps', 'minimum_jerk')  # and some sums of sines
+KINDS = (*CYCLIC, 'sum_of_sines', 'chirp', 'ramp', 'random', 'samples', 'topic')
+MOST_SAMPLES = 10_000  # they stand in the parameter file of every run
 PREDICTORS = ('constant_rate', 'constant_acceleration', 'sinusoid', 'preview')
 GRAVITY = 9.80665  # m/s^2
 
