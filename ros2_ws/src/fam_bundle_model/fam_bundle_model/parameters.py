@@ -166,10 +166,6 @@ class RecruitmentParameters:
     force_time_constant: float = positive('s', 'filter of the measured force')
     minimum_strain_rate: float = positive('1/s', 'slower is taken as standing still')
     minimum_dwell: float = number('s', 'least time between two shifts', minimum=0.0)
-    predictor: str = choice(
-        'how the strain is expected to go on', PREDICTORS, default='constant_rate'
-    )
-    prediction_horizon: float = number(
     reserve: float = number(
         'Pa',
         'source pressure kept in reserve by the prediction: more recruits earlier and tracks '
@@ -178,6 +174,10 @@ class RecruitmentParameters:
         minimum=-5e5,
         maximum=5e5,
     )
+    predictor: str = choice(
+        'how the strain is expected to go on', PREDICTORS, default='constant_rate'
+    )
+    prediction_horizon: float = number(
         's',
         "how far ahead the predictor's error is measured",
         default=0.3,
@@ -428,6 +428,8 @@ def make_configuration(
         check_lengths('pressure_loop', configuration.pressure_loop, configuration.fam)
     if configuration.recruitment is not None:
         check_recruitment(configuration.recruitment)
+    if configuration.reference is not None:
+        check_reference(configuration.reference)
     if configuration.run is not None and configuration.simulation is not None:
         check_run(configuration.run, configuration.simulation)
     return configuration
@@ -446,33 +448,6 @@ def check_run(run: RunParameters, simulation: SimulationParameters) -> None:
         )
 
 
-def check_fam(fam: FamParameters) -> None:
-    """Raise ConfigurationError unless the FAMs are equally long."""
-    if len(set(fam.length)) > 1:
-        raise ConfigurationError(
-            f'fam.length = {list(fam.length)} m: must be equal, for all FAMs share one strain'
-        )
-
-    if configuration.reference is not None:
-        check_reference(configuration.reference)
-
-def check_lengths(
-    group: str, values: FamParameters | PressureLoopParameters, fam: FamParameters
-) -> None:
-    """Raise ConfigurationError unless each parameter has one value, or one per motor unit."""
-    units = len(fam.count)
-    for name, value in vars(values).items():
-        if len(value) not in (1, units):
-            raise ConfigurationError(
-                f'{group}.{name}: {len(value)} values for {units} motor units; '
-                f'must be 1 or {units}'
-            )
-
-
-def check_recruitment(recruitment: RecruitmentParameters) -> None:
-    """Raise ConfigurationError where a unit would be released as soon as it is recruited."""
-    if recruitment.downshift_threshold >= recruitment.upshift_threshold:
-        raise ConfigurationError(
 def check_reference(reference: ReferenceParameters) -> None:
     """Raise ConfigurationError where the parameters of its kind do not fit together."""
     p = reference
@@ -523,6 +498,31 @@ def step_time(distance: float, rate: float, acceleration: float) -> float:
     return distance / rate + rate / acceleration
 
 
+def check_fam(fam: FamParameters) -> None:
+    """Raise ConfigurationError unless the FAMs are equally long."""
+    if len(set(fam.length)) > 1:
+        raise ConfigurationError(
+            f'fam.length = {list(fam.length)} m: must be equal, for all FAMs share one strain'
+        )
+
+
+def check_lengths(
+    group: str, values: FamParameters | PressureLoopParameters, fam: FamParameters
+) -> None:
+    """Raise ConfigurationError unless each parameter has one value, or one per motor unit."""
+    units = len(fam.count)
+    for name, value in vars(values).items():
+        if len(value) not in (1, units):
+            raise ConfigurationError(
+                f'{group}.{name}: {len(value)} values for {units} motor units; '
+                f'must be 1 or {units}'
+            )
+
+
+def check_recruitment(recruitment: RecruitmentParameters) -> None:
+    """Raise ConfigurationError where a unit would be released as soon as it is recruited."""
+    if recruitment.downshift_threshold >= recruitment.upshift_threshold:
+        raise ConfigurationError(
             f'recruitment.downshift_threshold = {recruitment.downshift_threshold:g}: must be < '
             f'recruitment.upshift_threshold = {recruitment.upshift_threshold:g}'
         )
