@@ -22,6 +22,7 @@ Array = npt.NDArray[np.float64]
 
 ORDER = 6  # coefficients of a piece
 FINENESS = 33  # points at which a piece is looked at for its extremes
+SHORTEST = 1e-3  # s that a way takes at least
 LONGER = 1.1  # what is too fast takes so much longer at the next try
 
 
@@ -266,7 +267,8 @@ def after(
     present = rate_of(before, time)
     if start == stop and present == 0.0:
         return wanted._replace(start=time)
-    taken = max(step_time(abs(stop - start), rate, acceleration), abs(present) / acceleration)
+    least = step_time(abs(stop - start), rate, acceleration)
+    taken = max(least, abs(present) / acceleration, SHORTEST)
     while True:
         way = np.array(quintic(start, present, stop, 0.0, taken))
         fastest = _largest(np.polynomial.polynomial.polyder(way), taken)

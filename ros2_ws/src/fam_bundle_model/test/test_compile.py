@@ -4,6 +4,7 @@
 This file runs itself a second time with FAM_BUNDLE_INTERPRET=1 and compares every number.
 """
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -14,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fam_bundle_model import bundle, compile, fam, hydraulics, lag_table, pressure_pi
-from fam_bundle_model.parameters import load_configuration
+from fam_bundle_model import bundle, compile, fam, hydraulics, lag_table, pressure_pi, reference
+from fam_bundle_model.parameters import KINDS, load_configuration
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 SAMPLES = 300
@@ -37,6 +38,10 @@ def evaluate():
     table = lag_table.LagTable(
         axis, axis, random.random((2, 5, 5)), random.random((2, 5, 5)) * 1e5
     )
+    waveforms = [
+        reference.reference_law(dataclasses.replace(configuration.reference, kind=kind))
+        for kind in KINDS[:8]
+    ]
     found = {'tables': [bits(law.compression), bits(law.slack)]}
 
     def note(function, *arguments):
@@ -60,6 +65,8 @@ def evaluate():
         note(bundle.modelled_strain, units, 1, 0.5 * p, load)
         note(bundle.balancing_pressure, units, 2, 0.05, load, 1e6)
         note(lag_table.look_up, table, 1, p, q)
+        for waveform in waveforms:
+            note(reference.strain_reference, waveform, random.uniform(-1.0, 21.0))
     none = np.empty((0, 5))
     for target in (5e4, 1.5e5):
         note(lag_table.fill_response, supply, gains, units[1], target, 1.0, 1e-3, 2, none)
