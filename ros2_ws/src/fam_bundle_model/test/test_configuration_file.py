@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Configuration files: the shipped one says where its values come from; broken ones are named."""
+"""Configuration files: shipped ones say where their values come from; broken ones are named."""
 
+import difflib
 import re
 
 import pytest
 
+from fam_bundle_model.doubts import doubts
 from fam_bundle_model.parameters import GROUPS, load_configuration, read_yaml
 from fam_bundle_model.schema import ConfigurationError, declarations
 
+EXAMPLES = ('one_unit.yaml', 'three_units.yaml', 'four_units.yaml')
+SHIPPED = ('lhacd.yaml', *EXAMPLES)
 ORIGINS = ('published', 'data sheet', 'calibrated', 'assumed', 'chosen')
 
 
@@ -23,18 +27,23 @@ def lines_with_values(text):
     assert group
 
 
-def test_every_value_says_where_it_comes_from(configuration_path):
+@pytest.fixture(params=SHIPPED)
+def shipped(request, configuration_path):
+    return configuration_path.parent / request.param
+
+
+def test_every_value_says_where_it_comes_from(shipped):
     silent = [
         f'{number}: {content.strip()}'
-        for number, content, comment in lines_with_values(configuration_path.read_text())
+        for number, content, comment in lines_with_values(shipped.read_text())
         if not comment.startswith(ORIGINS)
     ]
     assert silent == []
 
 
-def test_every_parameter_stands_on_a_line_of_its_own(configuration_path):
-    text = configuration_path.read_text()
-    given = sum(len(group) for group in read_yaml(configuration_path).values())
+def test_every_parameter_stands_on_a_line_of_its_own(shipped):
+    text = shipped.read_text()
+    given = sum(len(group) for group in read_yaml(shipped).values())
     assert len(list(lines_with_values(text))) == given
 
 
@@ -62,9 +71,43 @@ def test_the_published_values_are_those_of_the_paper(configuration):
     assert configuration.simulation.period == 0.001
 
 
-def test_the_shipped_file_names_only_known_parameters(configuration_path):
-    for group, values in read_yaml(configuration_path).items():
+def test_a_shipped_file_names_only_known_parameters(shipped):
+    for group, values in read_yaml(shipped).items():
         assert set(values) <= set(declarations(GROUPS[group]))
+
+
+@pytest.mark.parametrize('name', EXAMPLES)
+def test_an_example_differs_from_the_rig_of_the_paper_where_it_says_so(name, configuration_path):
+    """ROS 2 parameter files cannot include one another: each is whole, and this is their bond."""
+    rig, example = (
+        (configuration_path.parent / file).read_text().splitlines()
+        for file in (configuration_path.name, name)
+    )
+    differences = list(difflib.ndiff(rig, example))
+    own = [line[2:] for line in differences if line.startswith('+ ')]
+    replaced = [line[2:] for line in differences if line.startswith('- ')]
+    values = [line for line in own if not line.startswith('#')]
+    assert all(' here: ' in line for line in values)
+    assert [v.split(':')[0] for v in values] == [r.split(':')[0] for r in replaced if r[0] != '#']
+
+
+def test_the_examples_are_one_three_and_four_units_the_smallest_first(configuration_path):
+    for name, units in zip(EXAMPLES, (1, 3, 4), strict=True):
+        fam = load_configuration(configuration_path.parent / name).fam
+        assert len(fam.count) == units
+        assert list(fam.count) == sorted(fam.count)
+
+
+@pytest.mark.parametrize('name', EXAMPLES)
+def test_the_gains_of_an_example_are_those_of_the_paper_s_rig_per_muscle(
+    name, configuration, configuration_path
+):
+    example = load_configuration(configuration_path.parent / name)
+    for gain in ('proportional_gain', 'integral_gain'):
+        (of_two,) = getattr(configuration.pressure_loop, gain)
+        per_muscle = pytest.approx([of_two / 2.0 * fams for fams in example.fam.count])
+        assert list(getattr(example.pressure_loop, gain)) == per_muscle
+    assert doubts(example) == []
 
 
 @pytest.mark.parametrize(
