@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fam_bundle_bringup.failure import RunFailed
-from fam_bundle_control.pressure_loop import pressure_loop_step
+from fam_bundle_control.pressure_loop import PressureLoop, pressure_loop, pressure_loop_step
 from fam_bundle_control.recruitment import (
     Recruitment,
     RecruitmentState,
@@ -30,7 +30,6 @@ from fam_bundle_io.trace import Trace, empty_trace
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.lag_table import LagTable, cached_lag_table
 from fam_bundle_model.parameters import Configuration, seconds
-from fam_bundle_model.pressure_pi import PressureGains, pressure_gains
 from fam_bundle_model.reference import Reference, reference_law, strain_reference
 from fam_bundle_sim.plant import Plant, plant, plant_step, resting_state, truth
 from fam_bundle_sim.sensors import Sensors, measure, noise_samples, sensors
@@ -49,7 +48,7 @@ def run_block(
     rig: Plant,
     instruments: Sensors,
     outer: StrainLoop,
-    inner: tuple[PressureGains, ...],
+    inner: PressureLoop,
     policy: Recruitment,
     table: LagTable,
     trajectory: Reference,
@@ -78,11 +77,12 @@ def run_block(
         references[k] = strain_reference(trajectory, times[k])
         outer_state, asked = strain_loop_step(
             outer,
+            rig.units,
             outer_state,
             references[k],
             seen.strain,
             seen.source_pressure,
-            pressure[0],
+            pressure,
             period,
         )
         policy_state, decided = recruitment_step(
@@ -100,10 +100,12 @@ def run_block(
         )
         pressure_loop_step(
             inner,
+            rig.units,
             integral,
             decided.recruited,
             asked.pressure,
             decided.pressure_compensation,
+            seen.strain,
             seen.source_pressure,
             pressure,
             period,
@@ -166,7 +168,7 @@ def run_offline(
         rig,
         sensors(configuration.sensors, units),
         strain_loop(configuration),
-        pressure_gains(configuration),
+        pressure_loop(configuration),
         recruitment(configuration),
         cached_lag_table(configuration) if table is None else table,
         reference_law(configuration.reference),

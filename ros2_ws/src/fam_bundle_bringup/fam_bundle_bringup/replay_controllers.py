@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fam_bundle_control.pressure_loop import pressure_loop_step
+from fam_bundle_control.pressure_loop import pressure_loop, pressure_loop_step
 from fam_bundle_control.recruitment import (
     RecruitmentOutput,
     recruitment,
@@ -29,7 +29,6 @@ from fam_bundle_model.compile import direct
 from fam_bundle_model.hydraulics import TO_TANK
 from fam_bundle_model.lag_table import LagTable
 from fam_bundle_model.parameters import Configuration, seconds
-from fam_bundle_model.pressure_pi import pressure_gains
 from fam_bundle_model.reference import reference_law, strain_reference
 from fam_bundle_node.stamps import StampClock, begins_anew, nanoseconds
 from fam_bundle_node.ticks import TickError
@@ -190,20 +189,21 @@ def strain_answers(
 ) -> Columns:
     """Return what the strain controller answers: its message's fields, one entry for each step."""
     law, state = strain_loop(configuration), strain_loop_start()
-    trajectory = reference_law(configuration.reference)
-    step = direct(strain_loop_step, law, state, 0.0, 0.0, 0.0, 0.0, 1.0)
-    first_unit = samples.mu_pressure[:, 0].tolist()
+    units, trajectory = motor_units(configuration), reference_law(configuration.reference)
+    measured = (0.0, 0.0, 0.0, np.zeros(len(units)), 1.0)
+    step = direct(strain_loop_step, law, units, state, *measured)
     rows = []
     for row, dt, anew, _ in zip(*steps, strict=True):
         time = seconds(nanoseconds(samples.stamp[row]))
         reference = strain_reference(trajectory, time)
         state, output = step(
             law,
+            units,
             strain_loop_start() if anew else state,
             reference,
             samples.strain[row],
             samples.source_pressure[row],
-            first_unit[row],
+            samples.mu_pressure[row],
             dt,
         )
         rows.append((reference, *output))
@@ -254,11 +254,12 @@ def pressure_answers(
     could not be used, and such ones are not in the bag as it saw them.
     """
     samples = run.samples
-    units = samples.mu_pressure.shape[1]
-    gains, integral = pressure_gains(configuration), np.zeros(units)
+    law, bundle = pressure_loop(configuration), motor_units(configuration)
+    units = len(bundle)
+    integral = np.zeros(units)
     wanted, spool, saturated = np.zeros(units), np.zeros(units), np.zeros(units, dtype=np.bool_)
-    filled, none = (wanted, spool, saturated), (0, 0.0, 0.0, 0.0, np.zeros(units), 1.0)
-    step = direct(pressure_loop_step, gains, integral, *none, *filled)
+    filled, none = (wanted, spool, saturated), (0, 0.0, 0.0, 0.0, 0.0, np.zeros(units), 1.0)
+    step = direct(pressure_loop_step, law, bundle, integral, *none, *filled)
     ticks = [samples.tick[row] for row in steps.row]
     given = [
         run.answers[REFERENCE]['pressure'].loc[ticks].tolist(),
@@ -270,8 +271,9 @@ def pressure_answers(
     for row, dt, anew, _, reference, recruited, added, vent in zip(*steps, *given, strict=True):
         if anew:
             integral[:] = 0.0
-        source, pressure = samples.source_pressure[row], samples.mu_pressure[row]
-        step(gains, integral, recruited, reference, added, source, pressure, dt, *filled)
+        demand = (recruited, reference, added)
+        seen = (samples.strain[row], samples.source_pressure[row], samples.mu_pressure[row])
+        step(law, bundle, integral, *demand, *seen, dt, *filled)
         if vent:
             spool[:] = TO_TANK
         rows.append((*spool.tolist(), *wanted.tolist(), *saturated.tolist()))

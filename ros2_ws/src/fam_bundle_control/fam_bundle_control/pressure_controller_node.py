@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from fam_bundle_control.pressure_loop import pressure_loop_step
+from fam_bundle_control.pressure_loop import pressure_loop, pressure_loop_step
+from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.compile import direct
 from fam_bundle_model.hydraulics import TO_TANK
-from fam_bundle_model.pressure_pi import pressure_gains
 from fam_bundle_msgs.msg import BundleState, PressureReference, RecruitmentState, ValveCommand
 from fam_bundle_node.loop_node import Controller
 from fam_bundle_node.run import run_node
@@ -24,15 +24,20 @@ class PressureController(Controller):
 
     def __init__(self) -> None:
         """Compile the law before the first tick needs it."""
-        super().__init__('pressure_controller', ('fam', 'pressure_loop', 'simulation'))
-        units = len(self.configuration.fam.count)
-        self.gains = pressure_gains(self.configuration)
+        super().__init__(
+            'pressure_controller',
+            ('fam', 'source', 'oil', 'pressure_loop', 'allocation', 'simulation'),
+        )
+        self.law = pressure_loop(self.configuration)
+        self.units = motor_units(self.configuration)
+        units = len(self.units)
         self.integral = np.zeros(units)
         self.wanted, self.spool = np.zeros(units), np.zeros(units)
         self.saturated = np.zeros(units, dtype=np.bool_)
-        measured = (0, 0.0, 0.0, 0.0, np.zeros(units), 1.0)  # changes nothing
+        measured = (0, 0.0, 0.0, 0.0, 0.0, np.zeros(units), 1.0)  # changes nothing
         filled = (self.wanted, self.spool, self.saturated)
-        self.step = direct(pressure_loop_step, self.gains, self.integral, *measured, *filled)
+        model = (self.law, self.units, self.integral)
+        self.step = direct(pressure_loop_step, *model, *measured, *filled)
         self.message = ValveCommand()
         self.join = TickJoin(TOPICS, self.counts, strict=not self.realtime)
         self.publisher = self.loop_publisher(ValveCommand, 'valve_command')
@@ -72,11 +77,13 @@ class PressureController(Controller):
         """Answer one tick."""
         dt = self.time_step(seen)
         self.step(
-            self.gains,
+            self.law,
+            self.units,
             self.integral,
             recruitment.recruited,
             reference.pressure,
             recruitment.pressure_compensation,
+            seen.strain,
             seen.source_pressure,
             np.array(seen.mu_pressure),
             dt,

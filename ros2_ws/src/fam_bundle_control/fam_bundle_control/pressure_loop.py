@@ -1,29 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inner loops: one PI per motor unit, its output the spool command (Figures 3 and 5, b, c)."""
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
+from fam_bundle_control.allocation import allocate
+from fam_bundle_model.bundle import MotorUnit
 from fam_bundle_model.compile import compiled
-from fam_bundle_model.pressure_pi import PressureGains, clamp, pressure_pi
+from fam_bundle_model.parameters import ALLOCATIONS, Configuration
+from fam_bundle_model.pressure_pi import PressureGains, clamp, pressure_gains, pressure_pi
 
 
-@compiled
-def is_compensated(unit: int, recruited: int) -> bool:
-    """Return whether ``unit`` gets the pressure compensation: those before the newest recruit.
+class PressureLoop(NamedTuple):
+    """Gains of each motor unit, how the demand is allocated (see ``allocation``), and its limit.
 
-    A single recruited unit is compensated against the slack ones itself.
+    Each unit has its own gains: its loop is the faster, the less oil it holds.
     """
-    return unit < recruited and unit < max(recruited - 1, 1)
+
+    gains: tuple[PressureGains, ...]
+    allocation: int
+    nominal_pressure: float
+
+
+def pressure_loop(configuration: Configuration) -> PressureLoop:
+    """Return the law of ``configuration``."""
+    return PressureLoop(
+        pressure_gains(configuration),
+        ALLOCATIONS.index(configuration.allocation.policy),
+        configuration.source.nominal_pressure,
+    )
 
 
 @compiled
 def pressure_loop_step(
-    gains: tuple[PressureGains, ...],
+    law: PressureLoop,
+    units: tuple[MotorUnit, ...],
     integral: npt.NDArray[np.float64],
     recruited: int,
     pressure_reference: float,
     compensation: float,
+    strain: float,
     source_pressure: float,
     mu_pressure: npt.NDArray[np.float64],
     dt: float,
@@ -33,19 +51,26 @@ def pressure_loop_step(
 ) -> None:
     """Update ``integral`` and fill ``references`` (Pa), ``spool`` and ``saturated``, all (units,).
 
-    Each unit has its own ``gains``: its loop is the faster, the less oil it holds.
-    Recruited units follow the pressure reference, those before the newest with the compensation
-    on top, none above the source pressure (Pa). The others are vented: reference zero and no
-    integral share, so that a unit is recruited without a bump. ``dt`` in s.
+    Recruited units follow what they are allocated of the pressure reference. The others are
+    vented: reference zero and no integral share, so that a unit is recruited without a bump.
+    Pressures in Pa, ``dt`` in s.
     """
+    allocate(
+        law.allocation,
+        units,
+        law.nominal_pressure,
+        recruited,
+        pressure_reference,
+        compensation,
+        strain,
+        source_pressure,
+        mu_pressure,
+        references,
+    )
     for i in range(mu_pressure.shape[0]):
-        references[i] = 0.0
-        if i < recruited:
-            added = compensation if is_compensated(i, recruited) else 0.0
-            references[i] = clamp(pressure_reference + added, 0.0, max(source_pressure, 0.0))
-        else:
+        if i >= recruited:
             integral[i] = 0.0
-        share, asked = pressure_pi(gains[i], integral[i], references[i], mu_pressure[i], dt)
+        share, asked = pressure_pi(law.gains[i], integral[i], references[i], mu_pressure[i], dt)
         integral[i] = share
         spool[i] = clamp(asked, -1.0, 1.0)
         saturated[i] = spool[i] != asked

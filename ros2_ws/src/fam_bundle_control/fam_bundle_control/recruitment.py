@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fam_bundle_control.allocation import BATCH, is_compensated
 from fam_bundle_control.filters import filtered
 from fam_bundle_control.predictors import (
     Predictor,
@@ -27,17 +28,23 @@ from fam_bundle_control.predictors import (
     time_to_fall,
     time_to_rise,
 )
-from fam_bundle_control.pressure_loop import is_compensated
 from fam_bundle_model import fam
 from fam_bundle_model.bundle import MotorUnit, modelled_strain
 from fam_bundle_model.compile import compiled
+from fam_bundle_model.hydraulics import HydraulicLaw, hydraulic_law, line_loss
 from fam_bundle_model.lag_table import LagTable, look_up
-from fam_bundle_model.parameters import Configuration
+from fam_bundle_model.parameters import ALLOCATIONS, Configuration
 from fam_bundle_model.reference import Reference
+
+TAUT_SHARE = 0.05  # of the measured force; less is not told from noise
 
 
 class Recruitment(NamedTuple):
-    """Settings of the recruitment law; pressures in Pa, times in s."""
+    """Settings of the recruitment law; pressures in Pa, times in s.
+
+    ``hold_all`` keeps every unit recruited. ``own_flow`` says that a prediction reckons with what
+    the recruited units' own flow loses on its way from the source.
+    """
 
     predictor: Predictor
     lag_compensation: bool
@@ -46,6 +53,10 @@ class Recruitment(NamedTuple):
     downshift_pressure: float
     force_time_constant: float
     minimum_dwell: float
+    hold_all: bool
+    reserve: float
+    own_flow: bool
+    supply: HydraulicLaw
 
 
 class RecruitmentState(NamedTuple):
@@ -85,6 +96,10 @@ def recruitment(configuration: Configuration) -> Recruitment:
         downshift_pressure=p.downshift_threshold * nominal,
         force_time_constant=p.force_time_constant,
         minimum_dwell=p.minimum_dwell,
+        hold_all=p.scheme == 'all',
+        reserve=p.reserve,
+        own_flow=configuration.allocation.policy != ALLOCATIONS[BATCH],
+        supply=hydraulic_law(configuration),
     )
 
 
@@ -121,19 +136,50 @@ def compensating_pressure(
 
 @compiled
 def taut_units(
-    units: tuple[MotorUnit, ...], mu_pressure: npt.NDArray[np.float64], strain: float
+    units: tuple[MotorUnit, ...],
+    mu_pressure: npt.NDArray[np.float64],
+    strain: float,
+    force: float,
 ) -> int:
-    """Return how many units in a row, from the first on, are above their de-slack pressure.
+    """Return how many units in a row, from the first on, carry a share of the ``force`` (N).
 
     At least 1. So a supervisor that joins a running loop goes on with what is recruited.
     """
     count = 1
     while count < len(units):
-        pressure = mu_pressure[count]
-        if pressure <= 0.0 or pressure <= fam.deslack_pressure(units[count].fam, strain):
+        pressure, unit = mu_pressure[count], units[count]
+        carried = unit.fams * fam.force(unit.fam, max(pressure, 0.0), strain)
+        if pressure <= 0.0 or carried <= max(TAUT_SHARE * force, 0.0):
             break
         count += 1
     return count
+
+
+@compiled
+def attainable_pressure(
+    law: Recruitment,
+    units: tuple[MotorUnit, ...],
+    recruited: int,
+    source_pressure: float,
+    drop: float,
+    compensation: float,
+    strain: float,
+    rate: float,
+) -> float:
+    """Return the pressure in Pa that the recruited units can hold: equation 13 and what it omits.
+
+    ``drop`` and ``compensation`` are the margin of equation 12. The paper leaves out what the
+    units' own flow loses between source and muscle while the bundle moves at ``rate`` (1/s);
+    where the law reckons with it, the unit that loses most counts. A contraction takes k(e) L0 e'
+    of oil into each FAM (equations 1 and 8: virtual work).
+    """
+    loss = 0.0
+    if law.own_flow:
+        for i in range(recruited):
+            unit = units[i]
+            area = unit.fams * unit.fam.length * fam.mesh_coefficient(unit.fam, strain)
+            loss = max(loss, line_loss(law.supply, area * abs(rate)))
+    return source_pressure - drop - compensation - law.reserve - loss
 
 
 @compiled
@@ -158,10 +204,12 @@ def recruitment_step(
     recruited, load = state.recruited, force
     expected = predictor_step(law.predictor, state.expected, reference, time, strain, dt)
     if not state.started:
-        recruited = taut_units(units, mu_pressure, strain)
+        recruited = taut_units(units, mu_pressure, strain, force)
     else:
         load = filtered(state.force, force, law.force_time_constant, dt)
 
+    if law.hold_all:
+        recruited = len(units)
     newest = recruited - 1
     next_unit = min(recruited, len(units) - 1)
     deslack = fam.deslack_pressure(units[next_unit].fam, strain)
@@ -173,7 +221,8 @@ def recruitment_step(
     saturation = desaturation = math.inf
     lasts = comes_back = False
     if recruited < len(units) and may_rise(law.predictor, expected):
-        effective = source_pressure - lag.drop - compensation
+        given = (source_pressure, lag.drop, compensation, strain, expected.strain_rate)
+        effective = attainable_pressure(law, units, recruited, *given)
         limit = modelled_strain(units, recruited, effective, load)
         saturation = time_to_rise(law.predictor, expected, reference, limit)
         # A peak that is over before the unit is taut needs none.
@@ -182,7 +231,8 @@ def recruitment_step(
     if recruited > 1 and may_fall(law.predictor, expected):
         newest_deslack = fam.deslack_pressure(units[newest].fam, strain)
         release = look_up(table, newest, source_pressure, newest_deslack)
-        effective = source_pressure - release.drop - compensation
+        given = (source_pressure, release.drop, compensation, strain, expected.strain_rate)
+        effective = attainable_pressure(law, units, recruited - 1, *given)
         limit = modelled_strain(units, recruited - 1, effective, load)
         desaturation = time_to_fall(law.predictor, expected, reference, limit)
         # The unit could not be recruited again before the dwell is over, nor be taut a lag later.
@@ -201,7 +251,9 @@ def recruitment_step(
         down = mu_pressure[newest] <= law.downshift_pressure
     dwell = state.dwell + dt
     # A shift disturbs the very strain rate that the next decision rests on.
-    if up and dwell >= law.minimum_dwell:
+    if law.hold_all:
+        dwell = 0.0
+    elif up and dwell >= law.minimum_dwell:
         recruited, dwell, armed = recruited + 1, 0.0, False
     elif recruited > 1 and down and armed and dwell >= law.minimum_dwell:
         # Below the top state the newest unit has been taut already.

@@ -29,7 +29,9 @@ class RecruitmentSupervisor(Controller):
 
     def __init__(self) -> None:
         """Wait for the table."""
-        super().__init__('recruitment_supervisor', ('recruitment', 'reference', *PHYSICS))
+        super().__init__(
+            'recruitment_supervisor', ('recruitment', 'allocation', 'reference', *PHYSICS)
+        )
         self.law = recruitment(self.configuration)
         self.units = motor_units(self.configuration)
         self.trajectory = reference_law(self.configuration.reference)

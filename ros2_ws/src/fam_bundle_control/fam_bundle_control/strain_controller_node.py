@@ -3,7 +3,10 @@
 
 import sys
 
+import numpy as np
+
 from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
+from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.compile import direct
 from fam_bundle_model.parameters import seconds
 from fam_bundle_model.reference import reference_law, strain_reference
@@ -19,14 +22,27 @@ class StrainController(Controller):
     def __init__(self) -> None:
         """Compile the law before the first tick needs it."""
         super().__init__(
-            'strain_controller', ('fam', 'strain_loop', 'source', 'reference', 'simulation')
+            'strain_controller',
+            (
+                'fam',
+                'source',
+                'oil',
+                'load',
+                'strain_loop',
+                'allocation',
+                'reference',
+                'simulation',
+            ),
         )
         self.law = strain_loop(self.configuration)
+        self.units = motor_units(self.configuration)
         self.trajectory = reference_law(self.configuration.reference)
         self.message = PressureReference()
         self.restart()
         self.publisher = self.loop_publisher(PressureReference, 'pressure_reference')
-        self.step = direct(strain_loop_step, self.law, self.state_of_law, 0.0, 0.0, 0.0, 0.0, 1.0)
+        model = (self.law, self.units, self.state_of_law)
+        measured = (0.0, 0.0, 0.0, np.zeros(len(self.units)), 1.0)
+        self.step = direct(strain_loop_step, *model, *measured)
         self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state)
 
     def restart(self) -> None:
@@ -40,11 +56,12 @@ class StrainController(Controller):
         reference = strain_reference(self.trajectory, time)
         self.state_of_law, output = self.step(
             self.law,
+            self.units,
             self.state_of_law,
             reference,
             seen.strain,
             seen.source_pressure,
-            seen.mu_pressure[0],
+            np.array(seen.mu_pressure),
             dt,
         )
         answer = self.message

@@ -1,20 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The outer loop: PI on strain, its output the pressure reference (Figure 3a)."""
+"""The outer loop: PI on strain, its output the pressure reference (Figure 3a).
+
+Where the demand is allocated by force, the output is the pressure that all units of the bundle
+would need in common, and what the model knows of it is fed forward: the pressure that balances the
+load at the reference strain.
+"""
 
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
+from fam_bundle_control.allocation import BATCH, common_pressure, measured_force
+from fam_bundle_model.bundle import MotorUnit
 from fam_bundle_model.compile import compiled
-from fam_bundle_model.parameters import Configuration
+from fam_bundle_model.parameters import ALLOCATIONS, GRAVITY, Configuration
 from fam_bundle_model.pressure_pi import clamp
 
 
 class StrainLoop(NamedTuple):
-    """Gains in Pa and Pa/s per unit strain, tracking time in s, nominal pressure in Pa."""
+    """Gains in Pa and Pa/s per unit strain, tracking time in s, nominal pressure in Pa.
+
+    ``feedforward`` is the share of the balancing pressure under ``weight`` (N) that is fed
+    forward, where ``by_force`` says that the demand is allocated by force.
+    """
 
     proportional: float
     integral: float
     tracking_time: float
     nominal_pressure: float
+    by_force: bool
+    feedforward: float
+    weight: float
 
 
 class StrainLoopState(NamedTuple):
@@ -40,6 +57,9 @@ def strain_loop(configuration: Configuration) -> StrainLoop:
         gains.integral_gain,
         gains.tracking_time,
         configuration.source.nominal_pressure,
+        configuration.allocation.policy != ALLOCATIONS[BATCH],
+        configuration.allocation.feedforward,
+        configuration.load.mass * GRAVITY,
     )
 
 
@@ -51,24 +71,31 @@ def strain_loop_start() -> StrainLoopState:
 @compiled
 def strain_loop_step(
     law: StrainLoop,
+    units: tuple[MotorUnit, ...],
     state: StrainLoopState,
     reference: float,
     strain: float,
     source_pressure: float,
-    first_unit_pressure: float,
+    mu_pressure: npt.NDArray[np.float64],
     dt: float,
 ) -> tuple[StrainLoopState, StrainLoopOutput]:
     """Return the next state and the output; pressures in Pa, ``dt`` in s.
 
     The output is limited to what the source can give. Anti-windup by back-calculation over the
-    tracking time. The first call starts from the first motor unit's measured pressure, so that
-    the loop closes without a bump.
+    tracking time. The first call starts from the measured pressure of the first motor unit, or
+    from that which the force of all of them amounts to, so that the loop closes without a bump.
     """
     error = reference - strain
-    integral = state.integral
+    integral, present = state.integral, mu_pressure[0]
+    asked = law.proportional * error
+    if law.by_force:
+        count = len(units)
+        force = measured_force(units, 0, count, mu_pressure, strain)
+        present = common_pressure(units, 0, count, force, strain)
+        asked += law.feedforward * common_pressure(units, 0, count, law.weight, reference)
     if not state.started:
-        integral = first_unit_pressure - law.proportional * error
-    unlimited = law.proportional * error + integral
+        integral = present - asked
+    unlimited = asked + integral
     pressure = clamp(unlimited, 0.0, max(min(source_pressure, law.nominal_pressure), 0.0))
     integral += dt * (law.integral * error + (pressure - unlimited) / law.tracking_time)
     return StrainLoopState(integral, True), StrainLoopOutput(error, pressure, unlimited)

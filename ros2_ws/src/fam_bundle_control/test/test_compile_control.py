@@ -13,14 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from fam_bundle_control.pressure_loop import pressure_loop_step
+from fam_bundle_control.pressure_loop import pressure_loop, pressure_loop_step
 from fam_bundle_control.recruitment import recruitment, recruitment_start, recruitment_step
 from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
 from fam_bundle_model import compile
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.lag_table import LagTable
-from fam_bundle_model.parameters import load_configuration
-from fam_bundle_model.pressure_pi import pressure_gains
+from fam_bundle_model.parameters import ALLOCATIONS, AllocationParameters, load_configuration
 from fam_bundle_model.reference import still
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
@@ -43,10 +42,14 @@ def evaluate():
     axis = np.linspace(0.0, 7e5, 6)
     table = LagTable(axis, axis, random.random((2, 6, 6)), 1e5 * random.random((2, 6, 6)))
     found = {}
-    for scheme in ('baseline', 'lag_pressure'):
-        part = dataclasses.replace(configuration.recruitment, scheme=scheme)
-        policy = recruitment(dataclasses.replace(configuration, recruitment=part))
-        outer, gains = strain_loop(configuration), pressure_gains(configuration)
+    for scheme, allocation in zip(('baseline', 'lag_pressure', 'lag'), ALLOCATIONS, strict=True):
+        changed = dataclasses.replace(
+            configuration,
+            recruitment=dataclasses.replace(configuration.recruitment, scheme=scheme),
+            allocation=AllocationParameters(policy=allocation),
+        )
+        policy, outer = recruitment(changed), strain_loop(changed)
+        inner = pressure_loop(changed)
         state, outer_state = recruitment_start(), strain_loop_start()
         integral, references, spool = np.zeros((3, 2))
         saturated = np.zeros(2, dtype=bool)
@@ -56,17 +59,19 @@ def evaluate():
             pressures = random.uniform(0.0, 6.5e5, 2)
             force, source = random.uniform(150.0, 220.0), random.uniform(5e5, 6.9e5)
             outer_state, asked = strain_loop_step(
-                outer, outer_state, strain + 1e-3, strain, source, pressures[0], dt
+                outer, units, outer_state, strain + 1e-3, strain, source, pressures, dt
             )
             state, decided = recruitment_step(
                 policy, units, table, held, state, 0.0, strain, force, source, pressures, dt
             )
             pressure_loop_step(
-                gains,
+                inner,
+                units,
                 integral,
                 decided.recruited,
                 asked.pressure,
                 decided.pressure_compensation,
+                strain,
                 source,
                 pressures,
                 dt,

@@ -6,8 +6,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from fam_bundle_control.allocation import BATCH
 from fam_bundle_control.predictors import predictor_start
-from fam_bundle_control.pressure_loop import pressure_loop_step
+from fam_bundle_control.pressure_loop import PressureLoop, pressure_loop_step
 from fam_bundle_control.recruitment import recruitment_start, recruitment_step
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.pressure_pi import PressureGains
@@ -38,11 +39,13 @@ def test_units_are_recruited_in_order_and_released_in_reverse(
         )
         visited.append(output.recruited)
         pressure_loop_step(
-            (PressureGains(5e-6, 1e-6, 0.3),) * count,
+            PressureLoop((PressureGains(5e-6, 1e-6, 0.3),) * count, BATCH, 7e5),
+            units,
             integral,
             output.recruited,
             4e5,
             output.pressure_compensation,
+            strain,
             6.5e5,
             pressures,
             DT,

@@ -1,32 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inner loops: who follows what, who is vented, and what is said of the limit."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from fam_bundle_control.pressure_loop import is_compensated, pressure_loop_step
+from fam_bundle_control.allocation import BATCH, is_compensated
+from fam_bundle_control.pressure_loop import PressureLoop, pressure_loop_step
+from fam_bundle_model.bundle import motor_units
+from fam_bundle_model.parameters import load_configuration
 from fam_bundle_model.pressure_pi import PressureGains
 
+CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 DT = 0.001
 GAINS = PressureGains(5e-6, 2e-6, 0.3)
+UNIT = motor_units(load_configuration(CONFIGURATION))[0]
 
 
 class Loops:
     """The inner loops of ``count`` units, their pressures given."""
 
     def __init__(self, count, gains=None):
-        self.gains = gains or (GAINS,) * count
+        self.law = PressureLoop(gains or (GAINS,) * count, BATCH, 7e5)
+        self.units = (UNIT,) * count
         self.integral = np.zeros(count)
         self.references, self.spool = np.full((2, count), np.nan)
         self.saturated = np.zeros(count, dtype=bool)
 
     def step(self, recruited, pressures, reference=4e5, compensation=0.0, source=6.5e5):
         pressure_loop_step(
-            self.gains,
+            self.law,
+            self.units,
             self.integral,
             recruited,
             reference,
             compensation,
+            0.05,
             source,
             np.array(pressures, dtype=float),
             DT,

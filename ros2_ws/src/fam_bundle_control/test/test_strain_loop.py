@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The outer PI: its sums, its limits, its start and its way out of saturation."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,9 +15,21 @@ from fam_bundle_control.strain_loop import (
     strain_loop_start,
     strain_loop_step,
 )
+from fam_bundle_model.bundle import motor_units
+from fam_bundle_model.parameters import GRAVITY, load_configuration
 
+CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 DT = 0.001
-LAW = StrainLoop(proportional=4e7, integral=2e7, tracking_time=0.05, nominal_pressure=7e5)
+LAW = StrainLoop(
+    proportional=4e7,
+    integral=2e7,
+    tracking_time=0.05,
+    nominal_pressure=7e5,
+    by_force=False,
+    feedforward=0.0,
+    weight=0.0,
+)
+UNITS = motor_units(load_configuration(CONFIGURATION))
 
 
 def run(law, errors, source=7e5, start=2e5, state=None):
@@ -23,7 +37,8 @@ def run(law, errors, source=7e5, start=2e5, state=None):
     state = strain_loop_start() if state is None else state
     outputs = []
     for error in errors:
-        state, output = strain_loop_step(law, state, 0.05 + error, 0.05, source, start, DT)
+        measured = (0.05, source, np.array([start, 0.0]))
+        state, output = strain_loop_step(law, UNITS, state, 0.05 + error, *measured, DT)
         outputs.append(output)
     return outputs, state
 
@@ -35,6 +50,9 @@ def test_the_law_takes_its_gains_from_the_configuration(configuration):
         gains.integral_gain,
         gains.tracking_time,
         configuration.source.nominal_pressure,
+        False,
+        1.0,
+        configuration.load.mass * GRAVITY,
     )
 
 
@@ -96,7 +114,8 @@ def closed_loop(law, seconds=4.0):
     state, strain, strains = strain_loop_start(), 0.02, []
     for k in range(int(seconds / DT)):
         reference = 0.2 if k * DT < 2.0 else 0.05
-        state, output = strain_loop_step(law, state, reference, strain, 7e5, 1.4e5, DT)
+        measured = (strain, 7e5, np.array([1.4e5, 0.0]))
+        state, output = strain_loop_step(law, UNITS, state, reference, *measured, DT)
         strain += DT * (output.pressure / 7e6 - strain) / 0.1  # 0.1 at most
         strains.append(strain)
     return np.array(strains)

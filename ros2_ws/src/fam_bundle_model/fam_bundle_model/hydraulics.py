@@ -59,6 +59,16 @@ def unit_flow(law: HydraulicLaw, spool: float, source_pressure: float, pressure:
 
 
 @compiled
+def line_loss(law: HydraulicLaw, flow: float) -> float:
+    """Return the pressure in Pa that ``flow`` m^3/s loses in an open valve and its hose.
+
+    Equations 5 and 6 in series, solved for the pressure difference.
+    """
+    ratio = flow / law.valve_conductance
+    return law.hose_resistance * flow + ratio * abs(ratio)
+
+
+@compiled
 def source_pressure_rate(law: HydraulicLaw, source_pressure: float, flow: float) -> float:
     """Return the rate of the source pressure in Pa/s at ``flow`` m^3/s out of the source.
 

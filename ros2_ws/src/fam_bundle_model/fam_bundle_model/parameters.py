@@ -31,7 +31,8 @@ from fam_bundle_model.schema import (
 )
 
 PACES = ('lockstep', 'realtime')
-SCHEMES = ('baseline', 'lag', 'pressure', 'lag_pressure')
+SCHEMES = ('baseline', 'lag', 'pressure', 'lag_pressure', 'all')
+ALLOCATIONS = ('batch', 'force', 'orderly')
 CYCLIC = ('sine', 'trapezoid', 'steps', 'minimum_jerk')  # and some sums of sines
 KINDS = (*CYCLIC, 'sum_of_sines', 'chirp', 'ramp', 'random', 'samples', 'topic')
 MOST_SAMPLES = 10_000  # they stand in the parameter file of every run
@@ -183,6 +184,26 @@ class RecruitmentParameters:
         default=0.3,
         minimum=0.01,
         maximum=5.0,
+    )
+
+
+@dataclass(frozen=True)
+class AllocationParameters:
+    """What each recruited motor unit is asked for."""
+
+    policy: str = choice(
+        'batch: all the same pressure; force: shares of a force by the model; orderly: the '
+        'newest unit is controlled, those before it give what they can',
+        ALLOCATIONS,
+        default='batch',
+    )
+    feedforward: float = number(
+        '',
+        'share of the pressure that balances the load at the reference strain, fed forward by '
+        'the strain loop; force and orderly only',
+        default=1.0,
+        minimum=0.0,
+        maximum=1.0,
     )
 
 
@@ -368,6 +389,7 @@ class Configuration:
     strain_loop: StrainLoopParameters
     pressure_loop: PressureLoopParameters
     recruitment: RecruitmentParameters
+    allocation: AllocationParameters
     sensors: SensorParameters
     simulation: SimulationParameters
     lag_table: LagTableParameters

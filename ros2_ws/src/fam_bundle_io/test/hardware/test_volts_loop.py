@@ -8,7 +8,7 @@ import pytest
 from conftest import CONFIG
 
 from fam_bundle_bringup.offline import run_offline
-from fam_bundle_control.pressure_loop import pressure_loop_step
+from fam_bundle_control.pressure_loop import pressure_loop, pressure_loop_step
 from fam_bundle_control.recruitment import recruitment, recruitment_start, recruitment_step
 from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
 from fam_bundle_io.hardware.backend import load_backend, make_setup
@@ -20,7 +20,6 @@ from fam_bundle_io.trace import empty_trace
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.lag_table import cached_lag_table
 from fam_bundle_model.parameters import load_configuration, seconds
-from fam_bundle_model.pressure_pi import pressure_gains
 from fam_bundle_model.reference import reference_law, strain_reference
 
 
@@ -62,7 +61,7 @@ def through_volts(configuration, hardware, **options):
     monitor = Monitor(
         load_backend('volts'), setup, hardware.limits, c.source.nominal_pressure, clock=None
     )
-    laws = strain_loop(c), recruitment(c), cached_lag_table(c), pressure_gains(c)
+    laws = strain_loop(c), recruitment(c), cached_lag_table(c), pressure_loop(c)
     outer, policy, table, inner = laws
     outer_state, policy_state, integral = strain_loop_start(), recruitment_start(), np.zeros(2)
     wanted, spool, saturated = np.empty(2), np.empty(2), np.empty(2, dtype=np.bool_)
@@ -77,7 +76,7 @@ def through_volts(configuration, hardware, **options):
             time = seconds(k * c.period_ns())
             reference = strain_reference(trajectory, time)
             outer_state, asked = strain_loop_step(
-                outer, outer_state, reference, strain, source, pressure[0], period
+                outer, units, outer_state, reference, strain, source, pressure, period
             )
             policy_state, decided = recruitment_step(
                 policy,
@@ -94,10 +93,12 @@ def through_volts(configuration, hardware, **options):
             )
             pressure_loop_step(
                 inner,
+                units,
                 integral,
                 decided.recruited,
                 asked.pressure,
                 decided.pressure_compensation,
+                strain,
                 source,
                 pressure,
                 period,

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What each recruited motor unit is asked for (``docs/recruitment.md``, Allocation).
+
+``batch`` is the paper's: all recruited units follow one pressure reference. The other two are
+ours. There the strain loop's output is the pressure that all units of the bundle *would* need in
+common, which names a force whatever is recruited, and that force is shared out by the model.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from fam_bundle_model import fam
+from fam_bundle_model.bundle import MotorUnit
+from fam_bundle_model.compile import compiled
+from fam_bundle_model.parameters import ALLOCATIONS
+from fam_bundle_model.pressure_pi import clamp
+
+BATCH, FORCE, ORDERLY = range(len(ALLOCATIONS))
+
+
+@compiled
+def is_compensated(unit: int, recruited: int) -> bool:
+    """Return whether ``unit`` gets the pressure compensation: those before the newest recruit.
+
+    A single recruited unit is compensated against the slack ones itself.
+    """
+    return unit < recruited and unit < max(recruited - 1, 1)
+
+
+@compiled
+def common_pressure(
+    units: tuple[MotorUnit, ...], first: int, last: int, force: float, strain: float
+) -> float:
+    """Return the pressure in Pa at which units ``first`` to ``last - 1``, taut, hold ``force`` N.
+
+    The inverse of equations 1 and 2, which are linear in pressure. Zero where their braids cannot
+    pull at this strain.
+    """
+    passive = stiffness = 0.0
+    for i in range(first, last):
+        unit = units[i]
+        passive += unit.fams * fam.bladder_force(unit.fam, strain)
+        stiffness += unit.fams * fam.mesh_coefficient(unit.fam, strain)
+    return (force - passive) / stiffness if stiffness > 0.0 else 0.0
+
+
+@compiled
+def taut_force(units: tuple[MotorUnit, ...], pressure: float, strain: float) -> float:
+    """Return the force in N of all units, taut, at one ``pressure`` in Pa (equations 1 and 2)."""
+    total = 0.0
+    for i in range(len(units)):
+        total += units[i].fams * fam.straight_force(units[i].fam, pressure, strain)
+    return total
+
+
+@compiled
+def measured_force(
+    units: tuple[MotorUnit, ...],
+    first: int,
+    last: int,
+    mu_pressure: npt.NDArray[np.float64],
+    strain: float,
+) -> float:
+    """Return the modelled force in N of units ``first`` to ``last - 1`` at measured pressures."""
+    total = 0.0
+    for i in range(first, last):
+        pressure = max(mu_pressure[i], 0.0)
+        total += units[i].fams * fam.force(units[i].fam, pressure, strain)
+    return total
+
+
+@compiled
+def allocate(
+    policy: int,
+    units: tuple[MotorUnit, ...],
+    nominal_pressure: float,
+    recruited: int,
+    pressure_reference: float,
+    compensation: float,
+    strain: float,
+    source_pressure: float,
+    mu_pressure: npt.NDArray[np.float64],
+    references: npt.NDArray[np.float64],
+) -> None:
+    """Fill ``references`` (units,), the pressure in Pa that each unit shall have; vented ones 0.
+
+    ``batch``: the pressure reference, for the units before the newest with the compensation
+    (equation 11) on top, none above the source pressure.
+
+    ``force``: one pressure for all recruited units at which the bundle, with the vented units as
+    measured, has the force demanded. While the newest fills or a released one drains, the units
+    before it make up for what it does not give yet, or still gives.
+
+    ``orderly``: the units before the newest carry what they can, up to the full source pressure;
+    the newest carries the rest and is never let go slack.
+
+    Both are limited to the nominal pressure, not to the drooped source: a reference above what
+    the source has opens the valve fully.
+    """
+    count = len(units)
+    references[:] = 0.0
+    if policy == BATCH:
+        for i in range(recruited):
+            added = compensation if is_compensated(i, recruited) else 0.0
+            references[i] = clamp(pressure_reference + added, 0.0, max(source_pressure, 0.0))
+        return
+    newest, older = recruited - 1, max(recruited - 1, 1)
+    vented = measured_force(units, recruited, count, mu_pressure, strain)
+    share = taut_force(units, pressure_reference, strain) - vented
+    if policy == FORCE:
+        given = measured_force(units, older, recruited, mu_pressure, strain)
+        before = common_pressure(units, 0, older, share - given, strain)
+        last = common_pressure(units, 0, recruited, share, strain)
+    else:
+        # What a slack unit resists is made up for; what a taut one gives is its own rest.
+        given = min(measured_force(units, older, recruited, mu_pressure, strain), 0.0)
+        before = common_pressure(units, 0, older, share - given, strain)
+        carried = measured_force(units, 0, newest, mu_pressure, strain)
+        last = common_pressure(units, newest, recruited, share - carried, strain)
+        last = max(last, fam.deslack_pressure(units[newest].fam, strain))
+    for i in range(recruited):
+        wanted = before if i < older else last
+        references[i] = clamp(wanted, 0.0, max(source_pressure, nominal_pressure))
