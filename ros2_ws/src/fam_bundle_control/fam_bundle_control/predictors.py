@@ -4,11 +4,11 @@
 - constant rate: the measured strain goes on at its filtered rate (the paper's);
 - constant acceleration: a parabola, its acceleration over the next ``REACH`` only;
 - sinusoid: what the adaptive sinusoid of ``sinusoid.py`` does next;
-- preview: what the reference does next, at the present tracking error.
+- preview: what the reference does next, and the share of it that the strain goes along.
 
 All but the first stand on a filter of the strain that moves along with the trajectory: it takes
 noise away without a lag. Acceleration and sinusoid are weighed against the constant rate by how
-well each has done lately. ``docs/recruitment.md`` compares them.
+well each has done lately, preview against standing still. ``docs/recruitment.md`` compares them.
 """
 
 import math
@@ -41,12 +41,15 @@ from fam_bundle_model.reference import Reference, strain_reference
 
 CONSTANT_RATE, CONSTANT_ACCELERATION, SINUSOID, PREVIEW = range(len(PREDICTORS))
 REACH = 0.4  # s for which an acceleration is expected to last
-ACCELERATION_TIME_CONSTANT = 0.06  # s, of each of its four filters
+ACCELERATION_TIME_CONSTANT = 0.04  # s, of each of its four filters
 POSITION_TIME_CONSTANT = 0.05  # s, of the filter that moves along
-MEMORY = 1.0  # s, of the comparison with the constant rate
+MEMORY = 2.0  # s, of the comparison with the constant rate
+TRACKING_TIME_CONSTANT = 2.0  # s, with which the tracking error decays
+PREVIEW_MEMORY = 5.0  # s, of how far the strain goes along with the reference
+LEAST_PREVIEW = 0.5  # share: a strain that is held up must not hide what is wanted of it
 DOUBT = 1e-10  # mean squared difference (strain) below which the comparison tells nothing
 FAR, STEPS, HALVINGS = 2.0, 40, 30  # s that are searched for a crossing, in steps, then halved
-EXPECTED, BY_RATE, BY_MODEL = range(3)  # columns of the forecasts
+EXPECTED, SIMPLY, MODELLED = range(3)  # columns of the forecasts
 
 
 class Predictor(NamedTuple):
@@ -162,12 +165,15 @@ def predictor_step(
     error, agreement, difference = 0.0, state.agreement, state.difference
     if is_due(forecasts, law.horizon):
         error = strain - due(forecasts, EXPECTED, law.horizon)
-        by_rate = due(forecasts, BY_RATE, law.horizon)
-        apart = due(forecasts, BY_MODEL, law.horizon) - by_rate
-        agreement = filtered(agreement, (strain - by_rate) * apart, MEMORY, dt)
-        difference = filtered(difference, apart * apart, MEMORY, dt)
-    at_first = DOUBT if law.kind == CONSTANT_ACCELERATION else 0.0
-    weight = min(max((agreement + at_first) / (difference + DOUBT), 0.0), 1.0)
+        simply = due(forecasts, SIMPLY, law.horizon)
+        apart = due(forecasts, MODELLED, law.horizon) - simply
+        memory = PREVIEW_MEMORY if law.kind == PREVIEW else MEMORY
+        agreement = filtered(agreement, (strain - simply) * apart, memory, dt)
+        difference = filtered(difference, apart * apart, memory, dt)
+    # The best weight in the least-squares sense; the sinusoid has to show first what it can.
+    at_first = 0.0 if law.kind == SINUSOID else DOUBT
+    least = LEAST_PREVIEW if law.kind == PREVIEW else 0.0
+    weight = min(max((agreement + at_first) / (difference + DOUBT), least), 1.0)
     forecasts, row = next_row(forecasts, law.horizon)
     new = PredictorState(
         strain,
@@ -188,14 +194,28 @@ def predictor_step(
     if row >= 0:
         rows = forecasts.rows
         rows[row, 1 + EXPECTED] = expected_strain(law, new, reference, law.horizon)
-        rows[row, 1 + BY_RATE] = strain + rate * law.horizon
-        rows[row, 1 + BY_MODEL] = modelled(law, new, law.horizon)
+        rows[row, 1 + SIMPLY] = simply_expected(law, new, law.horizon)
+        rows[row, 1 + MODELLED] = modelled(law, new, reference, law.horizon)
     return new
 
 
 @compiled
-def modelled(law: Predictor, state: PredictorState, ahead: float) -> float:
-    """Return the strain ``ahead`` s from now by the parabola or the sinusoid."""
+def simply_expected(law: Predictor, state: PredictorState, ahead: float) -> float:
+    """Return the strain ``ahead`` s from now without a model, at constant rate.
+
+    Where the reference is known it tells the rate: the strain stands still without it.
+    """
+    return state.position if law.kind == PREVIEW else state.strain + state.strain_rate * ahead
+
+
+@compiled
+def modelled(law: Predictor, state: PredictorState, reference: Reference, ahead: float) -> float:
+    """Return the strain ``ahead`` s from now by the reference, the parabola or the sinusoid."""
+    if law.kind == PREVIEW:
+        now = strain_reference(reference, state.time)
+        coming = strain_reference(reference, state.time + ahead) - now
+        caught_up = 1.0 - math.exp(-ahead / TRACKING_TIME_CONSTANT)
+        return state.position + coming + caught_up * (now - state.position)
     if law.kind == SINUSOID:
         return state.position + sinusoid_ahead(state.sinusoid, ahead)
     lasts = min(ahead, REACH)
@@ -208,13 +228,10 @@ def expected_strain(
     law: Predictor, state: PredictorState, reference: Reference, ahead: float
 ) -> float:
     """Return the strain expected ``ahead`` s from now: equation 14 at constant rate."""
-    by_rate = state.strain + state.strain_rate * ahead
+    simply = simply_expected(law, state, ahead)
     if law.kind == CONSTANT_RATE:
-        return by_rate
-    if law.kind == PREVIEW:
-        coming = strain_reference(reference, state.time + ahead)
-        return state.position + coming - strain_reference(reference, state.time)
-    return by_rate + state.weight * (modelled(law, state, ahead) - by_rate)
+        return simply
+    return simply + state.weight * (modelled(law, state, reference, ahead) - simply)
 
 
 @compiled

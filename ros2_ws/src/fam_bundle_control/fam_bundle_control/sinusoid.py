@@ -19,8 +19,8 @@ from fam_bundle_control.filters import (
 )
 from fam_bundle_model.compile import compiled
 
-TIME_CONSTANT = 0.12  # s, of each filter of the cascade
-MEMORY = 3.0  # s, of the least squares
+TIME_CONSTANT = 0.08  # s, of each filter of the cascade
+MEMORY = 1.5  # s, of the least squares
 SLOWEST, FASTEST = 2.0 * math.pi * 0.01, 2.0 * math.pi * 1.0  # rad/s
 
 
@@ -71,6 +71,4 @@ def sinusoid_ahead(state: Sinusoid, ahead: float) -> float:
     w = state.frequency
     angle = w * ahead
     half = math.sin(0.5 * angle)
-    return (
-        state.velocity * math.sin(angle) / w + state.acceleration * 2.0 * half * half / (w * w)
-    )
+    return state.velocity * math.sin(angle) / w + state.acceleration * 2.0 * half * half / (w * w)
