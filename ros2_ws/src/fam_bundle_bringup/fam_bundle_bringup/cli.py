@@ -25,6 +25,7 @@ from fam_bundle_bringup.experiment import (
 from fam_bundle_bringup.one_line_parser import Parser
 from fam_bundle_bringup.rig_commands import NAMES as RIG_COMMANDS
 from fam_bundle_bringup.rig_commands import add_rig_commands, run_rig_command
+from fam_bundle_bringup.study_command import add_study, run_study
 from fam_bundle_model.parameters import KINDS, PREDICTORS, SCHEMES, Configuration
 from fam_bundle_model.reference_file import read_samples
 from fam_bundle_model.schema import ConfigurationError
@@ -60,6 +61,7 @@ def parser() -> Parser:
         choices=('volts',),
         help='those of the hardware bridge, on the simulated rig in volts',
     )
+    add_study(commands)
     _add_top(commands)
     add_bag_commands(commands)
     add_rig_commands(commands)
@@ -288,6 +290,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         if options.command in BAG_COMMANDS:
             return run_bag_command(options)
+        if options.command == 'study':
+            return run_study(options)
         if options.command in RIG_COMMANDS:
             return run_rig_command(options)
         results = RESULTS if options.command == 'experiment' else ()

@@ -23,10 +23,10 @@ COMPILED_PACKAGES = (
 )
 
 
-def source_digest() -> str:
-    """Return a digest of the sources of all packages that hold compiled functions."""
+def source_digest(packages: tuple[str, ...] = COMPILED_PACKAGES) -> str:
+    """Return a digest of the sources of ``packages``, of all that hold compiled functions."""
     digest = hashlib.sha256()
-    for package in COMPILED_PACKAGES:
+    for package in packages:
         spec = importlib.util.find_spec(package)
         for folder in (spec.submodule_search_locations or ()) if spec else ():
             for path in sorted(Path(folder).glob('*.py')):

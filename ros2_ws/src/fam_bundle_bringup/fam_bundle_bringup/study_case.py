@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One case of a study: its run offline and what is measured; and the rivals of its schemes."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fam_bundle_bringup.experiment import check_feasible, last_cycle
+from fam_bundle_bringup.failure import RunFailed
+from fam_bundle_bringup.hindsight import THRESHOLDS, best_threshold, with_threshold
+from fam_bundle_bringup.offline import run_offline
+from fam_bundle_io.energy import energy, powers
+from fam_bundle_io.metrics import (
+    Window,
+    needless_shifts,
+    shift_times,
+    shortest_interval,
+    ticks_in,
+    tracking,
+)
+from fam_bundle_io.trace import Trace
+from fam_bundle_model.lag_table import PHYSICS, LagTable, cached_lag_table
+from fam_bundle_model.parameters import Configuration
+from fam_bundle_model.schema import ConfigurationError
+
+Row = dict[str, Any]
+
+# What a run is measured by; None where it could not be. The window is that of every metric.
+MEASURED = (
+    'iae',
+    'max_error',
+    'rms_error',
+    'upshifts',
+    'downshifts',
+    'needless_shifts',
+    'shortest_interval',
+    'hydraulic_input',
+    'output',
+    'returned',
+    'throttling_loss',
+    'efficiency',
+)
+
+
+def measured(configuration: Configuration, trace: Trace) -> Row:
+    """Return the numbers of a whole run, in SI units.
+
+    Tracking and energy are taken over the window of the metrics, the last cycle; shifts over the
+    whole run. Raises ValueError where the trace does not reach that far or is not finite.
+    """
+    window = Window(*last_cycle(configuration))
+    inside = ticks_in(trace, window)
+    error = (trace['strain_reference'] - trace['strain'])[inside]
+    up, down = shift_times(trace)
+    interval = shortest_interval(trace)
+    spent = energy(trace, powers(trace, configuration), window)
+    efficiency = spent.efficiency
+    return {
+        **tracking(trace, *window)._asdict(),
+        'rms_error': float(np.sqrt(np.mean(error**2))),
+        'upshifts': len(up),
+        'downshifts': len(down),
+        'needless_shifts': needless_shifts(trace),
+        'shortest_interval': interval if np.isfinite(interval) else None,
+        'hydraulic_input': spent.hydraulic_input,
+        'output': spent.output,
+        'returned': spent.returned,
+        'throttling_loss': sum(spent.supply_loss) + sum(spent.return_loss),
+        'efficiency': efficiency if np.isfinite(efficiency) else None,
+    }
+
+
+def not_run(status: str, reason: str) -> Row:
+    """Return the row of a case without numbers."""
+    return {'status': status, 'reason': reason, **dict.fromkeys(MEASURED)}
+
+
+def run_case(configuration: Configuration, objection: Callable[[Trace], str] | None = None) -> Row:
+    """Return the row of one case: ``status``, ``reason`` and what it is measured by.
+
+    ``status`` is ``ok``; ``unreachable`` where the rig cannot do it, which is then not tried, or
+    where there is an ``objection`` to its trace; ``diverged`` where the run ended early.
+    """
+    try:
+        check_feasible(configuration)
+    except ConfigurationError as error:
+        return not_run('unreachable', str(error))
+    try:
+        trace = run_offline(configuration, table=lag_table_of(configuration))
+        if objection is not None and (reason := objection(trace)):
+            return not_run('unreachable', reason)
+        return {'status': 'ok', 'reason': '', **measured(configuration, trace)}
+    except (RunFailed, ValueError) as error:
+        return not_run('diverged', str(error))
+
+
+def lag_table_of(configuration: Configuration) -> LagTable:
+    """Return the lag table of ``configuration``; the last ones stay in memory."""
+    return _lag_table(_Table(configuration.hash(*PHYSICS, 'lag_table'), configuration))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Table:
+    """A configuration that is told apart only by what its lag table depends on."""
+
+    key: str
+    configuration: Configuration = dataclasses.field(compare=False)
+
+
+@functools.lru_cache(maxsize=16)
+def _lag_table(wanted: _Table) -> LagTable:
+    return cached_lag_table(wanted.configuration)
+
+
+# ---- Rivals ----
+
+
+def run_best_threshold(configuration: Configuration) -> Row:
+    """Return the row of the best fixed threshold for this very reference, by hindsight.
+
+    ``threshold`` is the one with the least IAE among those that do not chatter, ``steady`` how
+    many of those tried do not. ``unreachable`` where all do.
+    """
+    found = None
+    try:
+        check_feasible(configuration)
+        found = best_threshold(configuration)
+    except ConfigurationError as error:
+        reason = str(error)
+    else:
+        reason = 'every threshold chatters'
+    if found is None:
+        return {**not_run('unreachable', reason), 'threshold': None, 'steady': 0}
+    row = run_case(with_threshold(configuration, found.threshold))
+    return {**row, 'threshold': found.threshold, 'steady': found.steady}
+
+
+def always_recruited(configuration: Configuration) -> Configuration:
+    """Return ``configuration`` with all motor units recruited from the first ticks to the last.
+
+    The threshold rule with thresholds that the pressures never fall to: one unit joins at each
+    tick, and none leaves while it is under pressure.
+    """
+    recruitment = dataclasses.replace(
+        configuration.recruitment,
+        scheme='baseline',
+        upshift_threshold=0.05,
+        downshift_threshold=0.0,
+        minimum_dwell=0.0,
+    )
+    return dataclasses.replace(configuration, recruitment=recruitment)
+
+
+def run_always_recruited(configuration: Configuration) -> Row:
+    """Return the row of the same bundle with all motor units always recruited."""
+    units = len(configuration.fam.count)
+
+    def objection(trace: Trace) -> str:
+        held = (trace['recruitment_state'][units:] == units).all()
+        return '' if held else 'not all motor units stay under pressure'
+
+    return run_case(always_recruited(configuration), objection)
+
+
+class Rival(NamedTuple):
+    """A rival: what runs it, how many runs that takes, and its numbers beside those of a run."""
+
+    run: Callable[[Configuration], Row]
+    runs: int
+    extra: tuple[str, ...]
+
+
+RIVALS = {
+    'best_threshold': Rival(run_best_threshold, len(THRESHOLDS) + 1, ('threshold', 'steady')),
+    'always_recruited': Rival(run_always_recruited, 1, ()),
+}
