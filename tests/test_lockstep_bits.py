@@ -10,7 +10,7 @@ import pytest
 from fam_bundle_bringup.graph import run_graph
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.trace import PER_UNIT, SCALARS, Trace
-from fam_bundle_model.parameters import SCHEMES, Configuration
+from fam_bundle_model.parameters import PAPER_SCHEMES, Configuration
 
 
 def assert_same_bits(one: Trace, other: Trace) -> None:
@@ -20,7 +20,7 @@ def assert_same_bits(one: Trace, other: Trace) -> None:
         assert one[name].tobytes() == other[name].tobytes(), name
 
 
-@pytest.mark.parametrize('scheme', SCHEMES)
+@pytest.mark.parametrize('scheme', PAPER_SCHEMES)
 def test_graph_equals_one_process(
     scheme: str, quick: Callable[..., Configuration], tmp_path: Path
 ) -> None:
@@ -34,7 +34,7 @@ def test_graph_equals_one_process(
 def test_graph_equals_one_process_while_all_cores_are_busy(
     quick: Callable[..., Configuration], both_cores_busy: None, tmp_path: Path
 ) -> None:
-    configuration = quick('lag_pressure')
+    configuration = quick('lag_pressure', allocation={'policy': 'force'})
     assert_same_bits(run_graph(configuration, tmp_path), run_offline(configuration))
 
 
@@ -44,6 +44,11 @@ def test_graph_equals_one_process_with_sensor_noise_and_three_units(
     configuration = quick(
         'lag_pressure',
         fam={'count': [1, 1, 2]},
+        allocation={'policy': 'orderly'},
+        pressure_loop={
+            'proportional_gain': [3e-6, 3.5e-6, 7e-6],
+            'integral_limit': [0.1, 0.2, 0.3],
+        },
         sensors={'strain_noise': 1e-5, 'pressure_noise': 200.0, 'strain_resolution': 1e-6},
     )
     trace = run_graph(configuration, tmp_path)

@@ -81,7 +81,12 @@ def test_halving_the_substep_changes_no_strain(scheme: str) -> None:
 def test_any_number_of_motor_units_runs(counts: list[int], mass: float, highest: int) -> None:
     configuration = checked_configuration(
         default_configuration(),
-        {'fam': {'count': counts}, 'load': {'mass': mass}, 'reference': {'cycles': 1}},
+        {
+            'fam': {'count': counts},
+            'load': {'mass': mass},
+            'pressure_loop': {'proportional_gain': [3.4e-6 * fams for fams in counts]},
+            'reference': {'cycles': 1},
+        },
     )
     trace = run_offline(configuration)
     assert trace['mu_pressure'].shape == (configuration.ticks(), len(counts))

@@ -26,7 +26,14 @@ from fam_bundle_bringup.one_line_parser import Parser
 from fam_bundle_bringup.rig_commands import NAMES as RIG_COMMANDS
 from fam_bundle_bringup.rig_commands import add_rig_commands, run_rig_command
 from fam_bundle_bringup.study_command import add_study, run_study
-from fam_bundle_model.parameters import KINDS, PREDICTORS, SCHEMES, Configuration
+from fam_bundle_model.doubts import doubts
+from fam_bundle_model.parameters import (
+    ALLOCATIONS,
+    KINDS,
+    PREDICTORS,
+    SCHEMES,
+    Configuration,
+)
 from fam_bundle_model.reference_file import read_samples
 from fam_bundle_model.schema import ConfigurationError
 
@@ -90,6 +97,11 @@ def _add_experiment(commands: Any) -> None:
         '--scheme',
         metavar='|'.join(SCHEMES),
         help='what decides a shift, and what is compensated (default: as configured)',
+    )
+    experiment.add_argument(
+        '--allocation',
+        metavar='|'.join(ALLOCATIONS),
+        help='what each recruited motor unit is asked for (default: as configured, else batch)',
     )
     experiment.add_argument(
         '--predictor',
@@ -184,6 +196,7 @@ def changes_of(options: argparse.Namespace) -> Mapping[str, Mapping[str, Any]]:
     wanted = {
         ('recruitment', 'scheme'): options.scheme,
         ('recruitment', 'predictor'): options.predictor,
+        ('allocation', 'policy'): options.allocation,
         ('recruitment', 'upshift_threshold'): options.threshold,
         ('reference', 'amplitude'): options.amplitude,
         ('reference', 'frequency'): options.frequency,
@@ -311,6 +324,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise ConfigurationError(f'--record: {options.out}/bag exists: name another --out')
         config = options.config or default_configuration()
         configuration = checked_configuration(config, changes)
+        for doubt in doubts(configuration):
+            print(f'warning: {doubt}', file=sys.stderr)
         if getattr(options, 'pace', None) == 'offline' and configuration.reference.kind == 'topic':
             raise ConfigurationError('reference.kind = topic: --pace offline has no topics')
         if config.resolve() == (options.out / 'parameters.yaml').resolve():

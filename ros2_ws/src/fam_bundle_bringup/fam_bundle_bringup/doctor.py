@@ -319,6 +319,7 @@ def check_configuration(path: Path | None, hardware: Path | None, backend: str) 
     from fam_bundle_bringup.bridge_options import SIMULATED
     from fam_bundle_bringup.experiment import checked_configuration, default_configuration
     from fam_bundle_io.hardware.calibration import load_hardware
+    from fam_bundle_model.doubts import doubts
     from fam_bundle_model.schema import ConfigurationError
 
     path = path or default_configuration()
@@ -328,16 +329,18 @@ def check_configuration(path: Path | None, hardware: Path | None, backend: str) 
         return Result(MISSING, str(error))
     units = len(configuration.fam.count)
     found = f'{path.name}: {units} motor units, hash {configuration.hash()[:12]}'
+    doubted = doubts(configuration)
+    good = Result(WARNING, f'{found}; {"; ".join(doubted)}') if doubted else Result(OK, found)
     if hardware is None and backend not in SIMULATED:
-        return Result(OK, found)
+        return good
     try:
         rig = load_hardware(hardware or simulated_hardware())
     except ConfigurationError:
-        return Result(OK, found)  # a line of its own says so
+        return good  # a line of its own says so
     valves = len(rig.calibration.valves)
     if valves != units:
         return Result(MISSING, f'{found}, but {valves} valves in the hardware file')
-    return Result(OK, found)
+    return good
 
 
 # ---- All of it ----
