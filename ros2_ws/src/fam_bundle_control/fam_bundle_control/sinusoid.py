@@ -20,7 +20,7 @@ from fam_bundle_control.filters import (
 from fam_bundle_model.compile import compiled
 
 TIME_CONSTANT = 0.08  # s, of each filter of the cascade
-MEMORY = 1.5  # s, of the least squares
+MEMORY, SPAN = 1.5, 2.0  # of the least squares: at most so many s, and rad of the sinusoid
 SLOWEST, FASTEST = 2.0 * math.pi * 0.01, 2.0 * math.pi * 1.0  # rad/s
 
 
@@ -50,7 +50,7 @@ def sinusoid_step(state: Sinusoid, strain: float, dt: float) -> Sinusoid:
     """Return what is known after one tick's measured strain; ``dt`` in s."""
     filters = cascade_step(state.filters, strain, TIME_CONSTANT, dt)
     one, two, three = cascade_derivatives(filters, TIME_CONSTANT)
-    share = dt / (MEMORY + dt)
+    share = dt / (min(MEMORY, SPAN / state.frequency) + dt)
     covariance = state.covariance + (one * three - state.covariance) * share
     variance = state.variance + (one * one - state.variance) * share
     square = -covariance / variance if variance > 0.0 else 0.0
