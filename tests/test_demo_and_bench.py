@@ -13,7 +13,7 @@ from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.report_files import write_report
 from fam_bundle_io.shapes import paper_claims
 from fam_bundle_io.trace import Trace
-from fam_bundle_model.parameters import SCHEMES, Configuration
+from fam_bundle_model.parameters import PAPER_SCHEMES, Configuration
 from fam_bundle_model.schema import ConfigurationError
 
 FIGURES = {
@@ -54,7 +54,7 @@ def test_demo_writes_all_its_results(
     demo.run_demo(quick(), tmp_path)
     table = json.loads((tmp_path / 'table2.json').read_text())
     assert set(table) == set(demo.PAPER)
-    for scheme in SCHEMES:
+    for scheme in PAPER_SCHEMES:
         metrics = json.loads((tmp_path / scheme / 'metrics.json').read_text())
         assert metrics['scheme'] == scheme
         if scheme in table:
@@ -125,7 +125,7 @@ def traces(request: pytest.FixtureRequest) -> tuple[Configuration, dict[str, Tra
 
     configuration = load_configuration(default_configuration())
     found = {}
-    for scheme in SCHEMES:
+    for scheme in PAPER_SCHEMES:
         changes = {'recruitment': {'scheme': scheme}}
         found[scheme] = run_offline(load_configuration(default_configuration(), changes))
     return configuration, found

@@ -35,7 +35,7 @@ from fam_bundle_io.bag_writer import BagError
 from fam_bundle_io.completeness import tick_of
 from fam_bundle_model.parameters import (
     GRAVITY,
-    SCHEMES,
+    PAPER_SCHEMES,
     Configuration,
     load_configuration,
     write_yaml,
@@ -149,7 +149,7 @@ class Found:
 # ---- Lock-step ----
 
 
-@pytest.mark.parametrize('scheme', SCHEMES)
+@pytest.mark.parametrize('scheme', PAPER_SCHEMES)
 def test_controllers_and_plant_repeat_a_run_to_the_last_bit(
     scheme: str, recorded: Recorded, tmp_path: Path
 ) -> None:

@@ -31,7 +31,8 @@ from fam_bundle_model.schema import (
 )
 
 PACES = ('lockstep', 'realtime')
-SCHEMES = ('baseline', 'lag', 'pressure', 'lag_pressure', 'all')
+PAPER_SCHEMES = ('baseline', 'lag', 'pressure', 'lag_pressure')
+SCHEMES = (*PAPER_SCHEMES, 'all')  # the last keeps all units recruited: a rival
 ALLOCATIONS = ('batch', 'force', 'orderly')
 CYCLIC = ('sine', 'trapezoid', 'steps', 'minimum_jerk')  # and some sums of sines
 KINDS = (*CYCLIC, 'sum_of_sines', 'chirp', 'ramp', 'random', 'samples', 'topic')
