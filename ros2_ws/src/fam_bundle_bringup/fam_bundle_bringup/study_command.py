@@ -10,11 +10,15 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fam_bundle_bringup.experiment import prepare_folder
 from fam_bundle_bringup.progress import progress_bar
 from fam_bundle_model.schema import ConfigurationError
+
+if TYPE_CHECKING:
+    from fam_bundle_bringup.study import Study
+    from fam_bundle_bringup.study_result import Result
 
 Columns = Mapping[str, Sequence[Any]]
 
@@ -67,13 +71,19 @@ def run_study(options: argparse.Namespace) -> int:
     Raises ConfigurationError for a bad study, StudyStopped where it cannot go on.
     """
     from fam_bundle_bringup.study import read_study
-    from fam_bundle_bringup.study_result import read_result
+    from fam_bundle_bringup.study_result import can_parquet, read_result
 
     if options.dask is not None and options.workers is not None:
         raise ConfigurationError('--workers: a Dask cluster has its own')
     study = read_study(options.file)
     out: Path = options.out or Path('runs/study') / options.file.stem
-    result = read_result(out) if options.figures_only else _run(study, out, options)
+    if options.figures_only:
+        result = read_result(out)
+    else:
+        if not (options.csv or can_parquet()):
+            print('the Python package pyarrow is missing: CSV it is', file=sys.stderr)
+        as_csv = options.csv or not can_parquet()
+        result = run_cases(study, out, options.workers or cores(), options.dask, as_csv=as_csv)
     with progress_bar('figures', 1):
         figures = draw_figures(result.columns, result.provenance, out)
     print_summary(result.columns, result.provenance)
@@ -81,9 +91,17 @@ def run_study(options: argparse.Namespace) -> int:
     return 0
 
 
-def _run(study: Any, out: Path, options: argparse.Namespace) -> Any:
+def run_cases(
+    study: 'Study', out: Path, workers: int, dask: str | None = None, *, as_csv: bool = False
+) -> 'Result':
+    """Run what is not done of ``study``, write its result to the folder ``out`` and return it.
+
+    In so many processes, or on the Dask cluster at the address ``dask``. Raises
+    ConfigurationError where nothing of it can be run, StudyStopped where it cannot go on; rows
+    that are done stay in ``out`` then.
+    """
     from fam_bundle_bringup.study import cases_of
-    from fam_bundle_bringup.study_result import can_parquet, result_of, write_result
+    from fam_bundle_bringup.study_result import result_of, write_result
     from fam_bundle_bringup.study_run import (
         Journal,
         dask_cluster,
@@ -91,50 +109,39 @@ def _run(study: Any, out: Path, options: argparse.Namespace) -> Any:
         origin,
         processes,
         run_jobs,
+        runs_of,
     )
 
-    cases, made_by = cases_of(study), origin()
+    begin, cases, made_by = time.monotonic(), cases_of(study), origin()
     jobs = jobs_of(cases, study.rivals, made_by)
-    if all(case.configuration is None for case in cases):
+    if not jobs:
         raise ConfigurationError(f'{study.path}: no case can be run: {cases[0].reason}')
-    as_csv = options.csv or not can_parquet()
-    if as_csv and not options.csv:
-        print('the Python package pyarrow is missing: CSV in place of Parquet', file=sys.stderr)
     prepare_folder(out, ())
-    begin = time.monotonic()
     with contextlib.closing(Journal(out / JOURNAL)) as journal:
         prepare_folder(out, RESULTS)
-        new = [key for key in jobs if key not in journal.rows]
-        total = sum(job.runs for job in jobs.values())
-        executor = dask_cluster(options.dask) if options.dask else processes(_needed(options, new))
-        try:
-            if new:
-                with executor as pool, progress_bar(label(study, cases), total) as progress:
-                    run_jobs(jobs, journal, pool, progress)
-        except BaseException:
-            kept = sum(key in journal.rows for key in jobs)
-            print(
-                f'{kept} of {len(jobs)} rows are kept; the same command goes on', file=sys.stderr
-            )
-            raise
+        left = [key for key in jobs if key not in journal.rows]
+        workers = min(workers, len(left))
+        if left:
+            title = f'{study.path.stem}, {len(cases)} cases'
+            pool = dask_cluster(dask) if dask else processes(workers)
+            try:
+                with pool as executor, progress_bar(title, runs_of(jobs)) as progress:
+                    run_jobs(jobs, journal, executor, progress)
+            except BaseException:
+                kept = sum(key in journal.rows for key in jobs)
+                words = f'{kept} of {len(jobs)} rows are kept: the same command goes on from there'
+                print(words, file=sys.stderr)
+                raise
         run = {
-            'workers': options.dask or _needed(options, new),
-            'rows_run_now': len(new),
-            'elapsed': time.monotonic() - begin,
+            'workers': dask or workers,
+            'rows': len(jobs),
+            'rows_run_now': len(left),
+            'elapsed_now': time.monotonic() - begin,
             'cpu_time': sum(journal.cpu_times[key] for key in jobs),
         }
         result = result_of(study, cases, journal.rows, made_by, run)
         write_result(result, out, as_csv)
     return result
-
-
-def _needed(options: argparse.Namespace, jobs: Sequence[Any]) -> int:
-    return max(1, min(options.workers or cores(), len(jobs)))
-
-
-def label(study: Any, cases: Sequence[Any]) -> str:
-    """Return what the progress is of."""
-    return f'{study.path.stem}, {len(cases)} cases'
 
 
 # ---- Figures ----

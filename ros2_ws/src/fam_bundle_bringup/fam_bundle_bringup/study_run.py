@@ -85,6 +85,11 @@ def jobs_of(cases: Iterable[Case], rivals: Iterable[str], made_by: str) -> dict[
     return {job.key: job for job in jobs}
 
 
+def runs_of(jobs: Mapping[str, Job]) -> int:
+    """Return how many runs ``jobs`` are."""
+    return sum(job.runs for job in jobs.values())
+
+
 def row_of(case: Case, rows: Mapping[str, Row], made_by: str) -> Row:
     """Return the row of ``case``."""
     if case.configuration is None:
@@ -255,7 +260,7 @@ def run_jobs(
     first = {len(job.configuration.fam.count): job for job in left.values()}
     tables = {job.configuration.hash(*PHYSICS, 'lag_table'): job for job in left.values()}
 
-    runs = sum(job.runs for key, job in jobs.items() if key not in left)
+    runs = runs_of(jobs) - runs_of(left)
     progress(runs)
 
     def run(some: Iterable[Job]) -> None:

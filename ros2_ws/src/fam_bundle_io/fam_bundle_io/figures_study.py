@@ -5,7 +5,7 @@
 ``scheme``, the varied parameters, and what was measured.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -45,7 +45,9 @@ class Quantity(NamedTuple):
 def quantities(rivals: Sequence[str]) -> tuple[Quantity, ...]:
     """Return what heat maps are drawn of: tracking, ratios to the rivals, shifts, efficiency."""
     ratios = [
-        Quantity(f'{rival}.{name}_ratio', f'{words} over that of {_plain(rival)}', 1.0, '.2f')
+        Quantity(
+            f'{rival}.{name}_ratio', f'{words} over that of rival {_plain(rival)}', 1.0, '.2f'
+        )
         for rival in rivals
         for name, words in (('iae', 'IAE'), ('max_error', 'maximum error'))
     ]
@@ -107,6 +109,8 @@ def tradeoff_figure(columns: Columns, schemes: Sequence[str], rivals: Sequence[s
         *panels[0].get_legend_handles_labels(),
         loc='outside upper left',
         ncols=min(len(schemes) + len(rivals), 4),
+        title='large: median of all cases',
+        alignment='left',
     )
     return figure
 
@@ -160,13 +164,16 @@ def heat_map_figure(
     }
     across = min(ACROSS, len(found))
     down = -(-len(found) // across)
-    height = 0.8 + down * (0.75 + 0.26 * min(len(ticks[y]), 14))
+    height = 0.8 + down * (0.75 + 0.26 * min(max(len(ticks[y]), 4), 14))
     figure = Figure(figsize=(7.2, height))
     panels = figure.subplots(down, across, squeeze=False, sharex=True, sharey=True)
     scale = _scale([values for values, _, _ in found.values()], quantity)
     most = max((count for _, _, count in found.values()), default=1)
-    several = f', median of up to {most} cases' if most > 1 else ''
-    figure.suptitle(f'{quantity.words}{several}', x=0.01, horizontalalignment='left')
+    notes = [quantity.words]
+    notes += [f'median of up to {most} cases'] if most > 1 else []
+    notes += ['×: chatters'] if any(chatter.any() for _, chatter, _ in found.values()) else []
+    notes += ['hatched: no numbers'] if _has_gaps(found.values()) else []
+    figure.suptitle('; '.join(notes), x=0.01, horizontalalignment='left')
     image = None
     for axes, (name, (values, chatter, _)) in zip(panels.flat, found.items(), strict=False):
         image = axes.imshow(values, origin='lower', aspect='auto', **scale)
@@ -187,7 +194,13 @@ def heat_map_figure(
         bar = figure.colorbar(image, ax=panels, pad=0.01, aspect=12 * down)
         if quantity.is_ratio:
             _plain_ticks(bar.ax.yaxis)
+        elif quantity.text == 'g':
+            bar.ax.yaxis.set_major_locator(ticker.MaxNLocator(integer=True))
     return figure
+
+
+def _has_gaps(found: Iterable[tuple[Array, Any, int]]) -> bool:
+    return not all(np.isfinite(values).all() for values, _, _ in found)
 
 
 def _cells(

@@ -79,31 +79,55 @@ def shortest_interval(trace: Trace) -> float:
 def needless_shifts(trace: Trace) -> int:
     """Return how many shifts the reference gave no reason for: none unless the scheme chatters.
 
-    The reference has to cross the strain at which a step of the ladder is needed once for each
-    shift over that step. Wherever that strain is, between two upshifts over one step the
-    reference must then have fallen and risen again, between two downshifts risen and fallen. If
-    it did not, by more than ``SWING`` of its range, the second shift was needless. An upshift
-    acts one recruitment lag later: it may come as much before the reference turns.
+    The reference crosses the strain at which a step of the ladder is needed at most once in each
+    of its rises and falls, wherever that strain is. So each rise accounts for one shift up over
+    each step, each fall for one down. A shift up during a fall is late or early: it counts for
+    the rise before or after it; likewise down. What was before the run counts as either. What
+    rises or falls by less than ``SWING`` of the reference's range is part of what is around it.
     """
     reference, state = trace['strain_reference'], trace['recruitment_state'].astype(int)
     before = np.concatenate(([1 if trace['time'][0] == 0.0 else state[0]], state[:-1]))
-    enough = SWING * float(np.ptp(reference))
-    lag = np.where(np.isfinite(trace['recruitment_lag']), trace['recruitment_lag'], 0.0)
-    until = np.searchsorted(trace['time'], trace['time'] + lag, side='right')
+    turns, rises_first = _turns(reference, SWING * float(np.ptp(reference)))
     needless = 0
     for step in range(int(state.min()), int(state.max())):
-        ups = np.flatnonzero((before <= step) & (state > step))
-        needless += sum(_dip(reference[a : until[b]]) <= enough for a, b in pairwise(ups))
-        downs = np.flatnonzero((before > step) & (state <= step))
-        needless += sum(_dip(-reference[a : b + 1]) <= enough for a, b in pairwise(downs))
+        for up in (True, False):
+            low, high = (before, state) if up else (state, before)
+            shifts = np.flatnonzero((low <= step) & (high > step))
+            used = -2
+            for phase in np.searchsorted(turns, shifts, side='right').tolist():
+                # Odd phases go the way of the first one.
+                own = (phase % 2 == 1) == (rises_first == up)
+                around = (phase,) if own else (phase - 1, phase + 1)
+                free = [p for p in around if used < p <= len(turns)]
+                used = free[0] if free else used
+                needless += not free
     return needless
 
 
-def _dip(values: npt.NDArray[np.float64]) -> float:
-    """Return how far ``values`` fall and rise again."""
-    left = np.maximum.accumulate(values)
-    right = np.maximum.accumulate(values[::-1])[::-1]
-    return float((np.minimum(left, right) - values).max())
+def _turns(values: npt.NDArray[np.float64], enough: float) -> tuple[list[int], bool]:
+    """Return where ``values`` begin to rise or fall, in turn, by more than ``enough``.
+
+    And whether they rise first.
+    """
+    change = np.sign(np.diff(values))
+    moving = np.flatnonzero(change)
+    corners = moving[1:][np.diff(change[moving]) != 0]
+    turns: list[int] = []
+    rising = falling = rises_first = False
+    lowest = highest = 0
+    for k in [*corners.tolist(), len(values) - 1]:
+        lowest = k if values[k] < values[lowest] else lowest
+        highest = k if values[k] > values[highest] else highest
+        if not rising and values[k] - values[lowest] > enough:
+            rising, falling = True, False
+            rises_first = rises_first or not turns
+            turns.append(lowest)
+            highest = k
+        elif not falling and values[highest] - values[k] > enough:
+            rising, falling = False, True
+            turns.append(highest)
+            lowest = k
+    return turns, rises_first
 
 
 # ---- Cycles ----
