@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The energies of a run agree with mechanics and with each other."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -8,12 +9,13 @@ import pytest
 
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_bringup.offline import run_offline
-from fam_bundle_io.energy import Energy, energy, powers
+from fam_bundle_io.energy import Energy, energy, energy_by_state, powers
 from fam_bundle_io.metrics import Window, ticks_in, time_at_source, time_in_state, whole_cycles
 from fam_bundle_io.trace import Trace, empty_trace
 from fam_bundle_model import fam
-from fam_bundle_model.bundle import motor_units
+from fam_bundle_model.bundle import motor_units, state_force
 from fam_bundle_model.parameters import GRAVITY, Configuration, load_configuration
+from fam_bundle_sim.plant import UNITS, plant, plant_step, resting_state, truth
 
 Found = tuple[Configuration, Trace, Energy, Window]
 
@@ -116,6 +118,97 @@ def test_a_steady_source_gives_pressure_times_flow_times_time() -> None:
     assert found.hydraulic_input == pytest.approx(6.0)
     assert found.output == found.returned == 0.0
     assert found.efficiency == 0.0
+
+
+def test_states_share_the_energies_of_the_cycle(found: Found) -> None:
+    configuration, trace, energies, cycle = found
+    by_state = energy_by_state(trace, powers(trace, configuration), cycle)
+    assert set(by_state) == set(time_in_state(trace, cycle))
+    for name in ('hydraulic_input', 'output', 'returned', 'relieved', 'unexplained'):
+        shared = sum(getattr(spent, name) for spent in by_state.values())
+        assert shared == pytest.approx(getattr(energies, name), abs=1e-9)
+    for name in ('supply_loss', 'return_loss'):
+        losses = np.sum([getattr(spent, name) for spent in by_state.values()], axis=0)
+        assert losses == pytest.approx(getattr(energies, name), abs=1e-9)
+
+
+def random_trace(units: int = 3, ticks: int = 2000) -> Trace:
+    """Return a trace of units above and below source and tank, their spools at random."""
+    random, trace = np.random.default_rng(3), empty_trace(ticks, units)
+    for values in trace.values():
+        values.fill(0)
+    trace['time'][:] = 1e-3 * np.arange(ticks)
+    trace['source_pressure'][:] = random.uniform(3e5, 7e5, ticks)
+    trace['mu_pressure'][:] = random.uniform(-8e4, 9e5, (ticks, units))
+    trace['spool'][:] = random.uniform(-1.0, 1.0, (ticks, units))
+    trace['recruitment_state'][:] = random.integers(1, units + 1, ticks)
+    return trace
+
+
+def test_no_valve_makes_energy_and_what_is_not_lost_is_in_the_units() -> None:
+    """Tellegen: at every tick the source's power is the units' and the losses'; none is negative.
+
+    Units above the source push oil back through an open supply land, some of it into other
+    units, some through the source; a unit below the tank takes oil from it.
+    """
+    configuration = load_configuration(default_configuration(), {'fam': {'count': [1, 1, 2]}})
+    trace = random_trace()
+    flow = powers(trace, configuration)
+    trace['source_flow'][:] = np.where(flow.supplied, flow.flow, 0.0).sum(axis=1)
+    found = powers(trace, configuration)
+    assert (found.relieved > 0.0).any()
+    assert (found.source > 0.0).any()
+    for power in (found.source, found.relieved, found.supply_loss, found.return_loss):
+        assert (power >= 0.0).all()
+    assert not np.any((found.supply_loss > 0.0) & (found.return_loss > 0.0))
+    into_units = (trace['mu_pressure'] * found.flow).sum(axis=1)
+    lost = found.supply_loss.sum(axis=1) + found.return_loss.sum(axis=1) + found.relieved
+    assert found.source == pytest.approx(into_units + lost, abs=1e-9)
+    spent = energy(trace, found, Window(0.0, 2.0))
+    assert spent.unexplained == pytest.approx(into_units.sum() * 1e-3)
+    assert spent.modelled_oil == pytest.approx(1.0)
+
+
+def test_what_a_unit_pushes_back_through_the_source_is_relieved_and_no_input() -> None:
+    """The rig itself: oil trapped above the source pressure, and a supply land that opens."""
+    configuration = load_configuration(default_configuration(), {'fam': {'count': [2]}})
+    trapped = 1.5 * configuration.source.nominal_pressure
+    mass = state_force(motor_units(configuration), 1, trapped, 0.0) / GRAVITY  # is held by it
+    heavy = dataclasses.replace(configuration.load, mass=mass)
+    rig = plant(dataclasses.replace(configuration, load=heavy))
+    state, pressure = resting_state(configuration, rig), np.zeros(1)
+    state[UNITS] = fam.oil_of(rig.units[0].fam, trapped, 0.0, configuration.oil.bulk_modulus)
+    trace, spool = empty_trace(20, 1), np.array([0.1])
+    for values in trace.values():
+        values.fill(0)
+    for k in range(20):
+        seen = truth(rig, state, pressure)
+        trace['time'][k], trace['spool'][k], trace['mu_pressure'][k] = 1e-3 * k, spool, pressure
+        for name in ('strain', 'force', 'source_pressure', 'source_flow'):
+            trace[name][k] = getattr(seen, name)
+        plant_step(rig, state, spool, 1e-3, 20)
+    assert (trace['mu_pressure'][:, 0] > trace['source_pressure']).all()
+    assert trace['source_flow'].min() < -1e-5
+    spent = energy(trace, powers(trace, configuration), Window(0.0, 0.02))
+    back = -float((trace['source_pressure'] * trace['source_flow']).sum()) * 1e-3
+    assert spent.hydraulic_input == 0.0
+    assert spent.relieved == pytest.approx(back, rel=1e-3)
+    assert spent.return_loss == [0.0]
+    over = trace['mu_pressure'][:, 0] - trace['source_pressure']
+    assert spent.supply_loss[0] == pytest.approx(
+        -float((over * trace['source_flow']).sum()) * 1e-3, rel=1e-3
+    )
+
+
+def test_noise_of_the_flow_meter_is_no_input() -> None:
+    configuration = load_configuration(default_configuration())
+    trace = run_offline(configuration)
+    cycle = whole_cycles(trace, configuration)[-1]
+    ideal = energy(trace, powers(trace, configuration), cycle)
+    trace['source_flow'] += 2e-6 * np.random.default_rng(1).standard_normal(len(trace['time']))
+    noisy = energy(trace, powers(trace, configuration), cycle)
+    # 100 ticks' worth of the noise's power; its positive half alone would be 5 J.
+    assert noisy.hydraulic_input == pytest.approx(ideal.hydraulic_input, abs=0.5)
 
 
 def test_cycles_are_the_same_from_parameters_and_from_valleys() -> None:

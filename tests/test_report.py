@@ -84,6 +84,9 @@ def test_every_cycle_is_a_row(report: Path) -> None:
         assert float(row['iae']) == found['iae']
         assert int(row['upshifts']) == len(found['upshift_times'])
         assert float(row['energy_supply_loss_2']) == found['energy']['supply_loss'][1]
+        in_state = found['energy_in_state']
+        assert set(in_state) == set(found['time_in_state']) == {'1', '2'}
+        assert float(row['energy_in_state_2_output']) == in_state['2']['output']
 
 
 def test_all_figures_are_there(report: Path) -> None:

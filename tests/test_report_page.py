@@ -76,12 +76,12 @@ def test_the_page_works_in_a_browser_without_network(browser: Any, report: Path)
     assert {a for a in requested(browser) if not a.startswith('data:')} == {page}
     assert [entry for entry in browser.get_log('browser') if entry['level'] == 'SEVERE'] == []
     plots = browser.find_elements(By.CSS_SELECTOR, '.js-plotly-plot')
-    assert len(plots) == 6  # comparison, energy, two runs, two latencies
+    assert len(plots) == 7  # comparison, energy, by state, two runs, two latencies
     for plot in plots:
         drawn = plot.find_elements(By.CSS_SELECTOR, 'path.js-line, .bars path')
         assert drawn
         assert any(path.size['width'] > 20 for path in drawn)
-    panels = plots[2]
+    panels = plots[3]
     before = ranges(browser, panels)
     assert len(before) == 6
     assert all(np.allclose(found, before[0]) for found in before)

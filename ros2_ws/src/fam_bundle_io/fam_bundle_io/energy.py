@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the hydraulic energy of a run goes: into the load, and into the valves.
+"""Where the hydraulic energy of a run goes: into the load, and into the valves, by state.
 
 Our derivation. The source gives ``p_s Q_s``. Of that, the oil that enters unit i at its pressure
 carries ``p_i Q_i`` into the muscles; ``(p_s - p_i) Q_i`` is lost in valve and hose on the way, and
-``p_i Q_i`` of what leaves on its way to the tank. The load gets ``F L0`` per unit strain.
+``p_i Q_i`` of what leaves on its way to the tank. A unit above the source gives oil back through
+an open supply land: ``(p_s - p_i) Q_i`` is a loss then, too, for both factors are negative. What
+no other unit takes of it (``Q_s < 0``) the source relieves to the tank, and ``-p_s Q_s`` is lost.
+The load gets ``F L0`` per unit strain.
+
 Force, strain, pressures and the source's flow are measured; the flow of each unit is not: it comes
 from the spool commands and pressures by equations 5 and 6.
 """
@@ -29,26 +33,32 @@ class Powers(NamedTuple):
     """Powers in W at every tick: (ticks,), or (ticks, units) for those of motor units.
 
     ``load`` is what the bundle does on the load, negative where the load drives it;
-    ``contracting`` tells at which ticks the bundle shortens. ``flow`` (ticks, units) is the
-    modelled flow into each unit (m^3/s), negative out of it.
+    ``source`` is what it gives, ``relieved`` what comes back to it. ``contracting`` tells at which
+    ticks the bundle shortens. ``flow`` (ticks, units) is the modelled flow into each unit
+    (m^3/s), negative out of it; ``supplied`` (ticks, units) tells where it comes from the source
+    or goes back to it, not to the tank.
     """
 
     source: Array
+    relieved: Array
     load: Array
     contracting: npt.NDArray[np.bool_]
     supply_loss: Array
     return_loss: Array
     flow: Array
+    supplied: npt.NDArray[np.bool_]
 
 
 class Energy(NamedTuple):
-    """Energies in J over a window; those of motor units as lists.
+    """Energies in J over a window, or what of it was spent in one state; of motor units as lists.
 
     ``output`` is done on the load while the bundle contracts, ``returned`` is what the load gives
-    back while it lengthens. ``efficiency`` is ``output / hydraulic_input``. ``unexplained`` is
-    what the input leaves after work and losses: change of stored energy, errors of sensors and
-    model, and what the force law of slack FAMs makes or takes, which has no energy function
-    (docs/model.md). ``modelled_oil`` is the modelled flow into all units over the measured one.
+    back while it lengthens. ``supply_loss`` and ``return_loss`` are throttled in each unit's valve
+    and hose, between source and unit and on the way to the tank; ``relieved`` is what units push
+    back into the source. ``efficiency`` is ``output / hydraulic_input``. ``unexplained`` is what
+    the input leaves after work and losses: change of stored energy, errors of sensors and model,
+    and what the force law of slack FAMs makes or takes, which has no energy function
+    (docs/model.md). ``modelled_oil`` is the modelled flow out of the source over the measured one.
     """
 
     hydraulic_input: float
@@ -56,6 +66,7 @@ class Energy(NamedTuple):
     returned: float
     supply_loss: list[float]
     return_loss: list[float]
+    relieved: float
     unexplained: float
     efficiency: float
     modelled_oil: float
@@ -69,12 +80,17 @@ def _spool_and_flow(
     source: Array,
     pressure: Array,
     flow: Array,
+    supplied: npt.NDArray[np.bool_],
 ) -> None:
-    """Fill ``flow`` (ticks, units): each command acts from its tick on, behind the spool's lag."""
+    """Fill ``flow`` and ``supplied`` (ticks, units).
+
+    Each command acts from its tick on, behind the spool's lag.
+    """
     for unit in range(command.shape[1]):
         spool = 0.0
         for tick in range(command.shape[0]):
             flow[tick, unit] = unit_flow(law, spool, source[tick], pressure[tick, unit])
+            supplied[tick, unit] = spool > 0.0
             decay = math.exp(-step[tick] / law.spool_time_constant)
             spool = command[tick, unit] + (spool - command[tick, unit]) * decay
 
@@ -90,17 +106,21 @@ def powers(
     command = trace['spool'] if applied_spool is None else applied_spool
     law, step = hydraulic_law(configuration), steps(trace)
     source, pressure = trace['source_pressure'], trace['mu_pressure']
-    flow = np.zeros_like(pressure)
-    _spool_and_flow(law, step, command, source, pressure, flow)
+    flow, supplied = np.zeros_like(pressure), np.zeros(pressure.shape, dtype=np.bool_)
+    _spool_and_flow(law, step, command, source, pressure, flow, supplied)
+    drawn = np.where(supplied, flow, 0.0).sum(axis=1)
     length = configuration.fam.length[0]
     speed = np.gradient(trace['strain'], trace['time'])
     return Powers(
-        source=source * trace['source_flow'],
+        # By the model's direction, for the positive part of a noisy flow would be too much.
+        source=np.where(drawn >= 0.0, source * trace['source_flow'], 0.0),
+        relieved=np.where(drawn < 0.0, -source * drawn, 0.0),
         load=trace['force'] * length * speed,
         contracting=_contracting(trace['strain'], float(np.median(step))),
-        supply_loss=np.clip(flow, 0.0, None) * (source[:, None] - pressure),
-        return_loss=np.clip(-flow, 0.0, None) * pressure,
+        supply_loss=np.where(supplied, flow * (source[:, None] - pressure), 0.0),
+        return_loss=np.where(supplied, 0.0, -flow * pressure),
         flow=flow,
+        supplied=supplied,
     )
 
 
@@ -116,14 +136,17 @@ def _contracting(strain: Array, step: float) -> npt.NDArray[np.bool_]:
     return np.asarray(np.gradient(smooth) > 0.0, dtype=np.bool_)
 
 
-def energy(trace: Trace, found: Powers, window: Window) -> Energy:
+def energy(trace: Trace, found: Powers, window: Window, state: int | None = None) -> Energy:
     """Return what the powers ``found`` in ``trace`` come to within ``window``.
 
-    Raises ValueError where something in it is not finite.
+    Only of the ticks with ``state`` units recruited, if that is given. Raises ValueError where
+    something in it is not finite.
     """
     inside = ticks_in(trace, window)
+    if state is not None:
+        inside &= trace['recruitment_state'] == state
     step = steps(trace)[inside]
-    for power in (found.source, found.load, found.supply_loss, found.return_loss):
+    for power in (found.source, found.load, found.relieved, found.supply_loss, found.return_loss):
         if not np.isfinite(power[inside]).all():
             raise ValueError('a power is not finite')
 
@@ -133,7 +156,7 @@ def energy(trace: Trace, found: Powers, window: Window) -> Energy:
     def of_units(power: Array) -> list[float]:
         return [float(e) for e in (power[inside] * step[:, None]).sum(axis=0)]
 
-    given = total(found.source)
+    given, relieved = total(found.source), total(found.relieved)
     output = total(np.where(found.contracting, found.load, 0.0))
     returned = -total(np.where(found.contracting, 0.0, found.load))
     supply, back = of_units(found.supply_loss), of_units(found.return_loss)
@@ -144,7 +167,20 @@ def energy(trace: Trace, found: Powers, window: Window) -> Energy:
         returned=returned,
         supply_loss=supply,
         return_loss=back,
-        unexplained=given - (output - returned) - sum(supply) - sum(back),
+        relieved=relieved,
+        unexplained=given - (output - returned) - sum(supply) - sum(back) - relieved,
         efficiency=output / given if given > 0.0 else math.nan,
-        modelled_oil=total(np.clip(found.flow, 0.0, None).sum(axis=1)) / oil if oil else math.nan,
+        modelled_oil=(
+            total(np.where(found.supplied, found.flow, 0.0).sum(axis=1)) / oil if oil else math.nan
+        ),
     )
+
+
+def energy_by_state(trace: Trace, found: Powers, window: Window) -> dict[int, Energy]:
+    """Return ``energy`` of each number of recruited units that occurs within ``window``.
+
+    Energies add up to those of the window. What is stored in one state and spent in another
+    stands in ``unexplained`` of both. Raises ValueError where something is not finite.
+    """
+    states = np.unique(trace['recruitment_state'][ticks_in(trace, window)])
+    return {int(state): energy(trace, found, window, int(state)) for state in states}

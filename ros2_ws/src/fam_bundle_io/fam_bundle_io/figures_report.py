@@ -35,6 +35,8 @@ def energy_figure(energies: Mapping[str, Mapping[str, Any]]) -> Figure:
                 (f'lost {word} MU{unit + 1}', loss, UNIT_COLOURS[unit % len(UNIT_COLOURS)], hatch)
                 for unit, loss in enumerate(found[kind])
             ]
+        if found['relieved']:
+            parts.append(('relieved', found['relieved'], '#666666', ''))
         parts.append(('unexplained', found['unexplained'], '#cccccc', ''))
         left = {True: 0.0, False: 0.0}  # above and below zero
         for label, value, colour, hatch in parts:

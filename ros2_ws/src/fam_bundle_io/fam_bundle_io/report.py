@@ -22,7 +22,7 @@ from fam_bundle_io.bag import (
     trace_of,
 )
 from fam_bundle_io.bag_writer import BagError
-from fam_bundle_io.energy import Powers, energy, powers
+from fam_bundle_io.energy import Powers, energy, energy_by_state, powers
 from fam_bundle_io.metrics import (
     Window,
     shift_times,
@@ -251,6 +251,7 @@ def _window_numbers(
             'time_in_state',
             'time_at_source',
             'energy',
+            'energy_in_state',
         )
     )
     if window is None:
@@ -271,6 +272,9 @@ def _window_numbers(
     if found is not None:
         with contextlib.suppress(ValueError):  # not finite
             numbers['energy'] = energy(trace, found, window)._asdict()
+            if 'recruitment_state' not in missing:
+                spent = energy_by_state(trace, found, window)
+                numbers['energy_in_state'] = {str(k): e._asdict() for k, e in spent.items()}
     return numbers
 
 

@@ -2,7 +2,7 @@
 """The report as one interactive page: nothing in it is loaded from elsewhere."""
 
 import html
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -59,6 +59,8 @@ def report_page(runs: Sequence[ReportedRun], troubles: Sequence[str]) -> str:
         parts += ['<h2 id="comparison">Last cycle of every run</h2>', _drawn(comparison(runs))]
     if any(run.numbers['energy'] for run in runs):
         parts += ['<h2 id="energy">Energy of the last cycle</h2>', _energy_section(runs)]
+    if any(run.numbers['energy_in_state'] for run in runs):
+        parts.append(_state_section(runs))
     for number, run in enumerate(runs):
         parts += _run_section(run, number)
     parts += ['<h2 id="timing">Timing of the loop</h2>', *_timing_section(runs)]
@@ -361,55 +363,22 @@ def comparison(runs: Sequence[ReportedRun]) -> 'Figure':
 
 
 def _energy_section(runs: Sequence[ReportedRun]) -> str:
-    from plotly.graph_objects import Figure
-
-    known = [run for run in runs if run.numbers['energy']]
-    units = max(len(run.numbers['energy']['supply_loss']) for run in known)
-    figure, rows = Figure(), []
-
-    def bar(name: str, values: list[float], colour: str, **marker: Any) -> None:
-        figure.add_bar(
-            y=[run.name for run in known],
-            x=values,
-            name=name,
-            orientation='h',
-            marker={'color': colour, **marker},
+    known = {run.name: run.numbers['energy'] for run in runs if run.numbers['energy']}
+    rows = (
+        (
+            name,
+            _number(e['hydraulic_input'], '.3f'),
+            _number(e['output'], '.3f'),
+            _number(e['returned'], '.3f'),
+            _number(sum(e['supply_loss']), '.3f'),
+            _number(sum(e['return_loss']), '.3f'),
+            _number(e['relieved'], '.3f'),
+            _number(e['unexplained'], '.3f'),
+            _number(e['efficiency'], '.1%'),
+            _number(e['modelled_oil'], '.4f'),
         )
-
-    def of_unit(run: ReportedRun, kind: str, unit: int) -> float:
-        losses = run.numbers['energy'][kind]
-        return float(losses[unit]) if unit < len(losses) else 0.0
-
-    energies = [run.numbers['energy'] for run in known]
-    bar('net work on the load', [e['output'] - e['returned'] for e in energies], '#0072B2')
-    for unit in range(units):
-        colour = UNIT_COLOURS[unit % len(UNIT_COLOURS)]
-        for kind, word, pattern in (('supply_loss', 'into', ''), ('return_loss', 'out of', '/')):
-            losses = [of_unit(run, kind, unit) for run in known]
-            bar(f'lost {word} MU{unit + 1}', losses, colour, pattern={'shape': pattern})
-    bar('unexplained', [e['unexplained'] for e in energies], '#cccccc')
-    figure.update_layout(
-        template='plotly_white',
-        barmode='relative',
-        height=180 + 60 * len(known),
-        margin={'l': 20, 'r': 20, 't': 35, 'b': 45},
-        xaxis_title='energy of the last cycle (J)',
-        yaxis={'automargin': True, 'autorange': 'reversed'},
+        for name, e in known.items()
     )
-    for run, e in zip(known, energies, strict=True):
-        rows.append(
-            (
-                run.name,
-                _number(e['hydraulic_input'], '.3f'),
-                _number(e['output'], '.3f'),
-                _number(e['returned'], '.3f'),
-                _number(sum(e['supply_loss']), '.3f'),
-                _number(sum(e['return_loss']), '.3f'),
-                _number(e['unexplained'], '.3f'),
-                _number(e['efficiency'], '.1%'),
-                _number(e['modelled_oil'], '.4f'),
-            )
-        )
     headings = (
         'energy (J)',
         'input',
@@ -417,18 +386,103 @@ def _energy_section(runs: Sequence[ReportedRun]) -> str:
         'returned',
         'lost in supply',
         'lost in return',
+        'relieved',
         'unexplained',
         'efficiency',
         'modelled / measured oil',
     )
     note = (
         '<p class="note">Input, output and what the load gives back are measured. The losses in '
-        'valves and hoses are modelled, for the flow of each unit is not measured; the last '
+        'valves and hoses, and what units push back into the source, which relieves it, are '
+        'modelled, for the flow of each unit is not measured; the last '
         'column says how well the modelled flow of all units agrees with the measured one. '
         'Unexplained is the rest, also what the force law of slack muscles makes or takes: it has '
         'no energy function there.</p>'
     )
-    return _drawn(figure) + table(headings, rows) + note
+    return _drawn(_energy_bars(known)) + table(headings, rows) + note
+
+
+def _state_section(runs: Sequence[ReportedRun]) -> str:
+    """Return a bar and a row for each recruitment state of each run."""
+    known, times = dict[str, dict[str, Any]](), list[float]()
+    for run in runs:
+        for state, spent in (run.numbers['energy_in_state'] or {}).items():
+            known[f'{run.name}, state {state}'] = spent
+            times.append(run.numbers['time_in_state'][state])
+    units = range(max(len(e['supply_loss']) for e in known.values()))
+    headings = [
+        'energy (J)',
+        'time (s)',
+        'input',
+        'output',
+        'returned',
+        *(f'lost {word} MU{unit + 1}' for unit in units for word in ('into', 'out of')),
+        'relieved',
+        'stored and unexplained',
+    ]
+    rows = (
+        [
+            name,
+            _number(time, '.3f'),
+            *(_number(e[part], '.3f') for part in ('hydraulic_input', 'output', 'returned')),
+            *(
+                _number(_of_unit(e, kind, unit), '.3f')
+                for unit in units
+                for kind in ('supply_loss', 'return_loss')
+            ),
+            _number(e['relieved'], '.3f'),
+            _number(e['unexplained'], '.3f'),
+        ]
+        for time, (name, e) in zip(times, known.items(), strict=True)
+    )
+    note = (
+        '<p class="note">State 2: two motor units are recruited. The rows of a run add up to the '
+        'energies above. What is stored in one state, in oil, bladders and slack muscles, and '
+        'given back in another stands in the last column of both.</p>'
+    )
+    title = '<h3 id="states">By recruitment state</h3>'
+    return title + _drawn(_energy_bars(known)) + table(headings, rows) + note
+
+
+def _of_unit(energies: Mapping[str, Any], kind: str, unit: int) -> float:
+    losses = energies[kind]
+    return float(losses[unit]) if unit < len(losses) else 0.0
+
+
+def _energy_bars(energies: Mapping[str, Mapping[str, Any]]) -> 'Figure':
+    """Return where the input went, a bar for each name."""
+    from plotly.graph_objects import Figure
+
+    figure = Figure()
+    spent = list(energies.values())
+
+    def bar(name: str, values: list[float], colour: str, **marker: Any) -> None:
+        figure.add_bar(
+            y=list(energies),
+            x=values,
+            name=name,
+            orientation='h',
+            marker={'color': colour, **marker},
+        )
+
+    bar('net work on the load', [e['output'] - e['returned'] for e in spent], '#0072B2')
+    for unit in range(max(len(e['supply_loss']) for e in spent)):
+        colour = UNIT_COLOURS[unit % len(UNIT_COLOURS)]
+        for kind, word, pattern in (('supply_loss', 'into', ''), ('return_loss', 'out of', '/')):
+            losses = [_of_unit(e, kind, unit) for e in spent]
+            bar(f'lost {word} MU{unit + 1}', losses, colour, pattern={'shape': pattern})
+    if any(e['relieved'] for e in spent):
+        bar('relieved', [e['relieved'] for e in spent], '#666666')
+    bar('unexplained', [e['unexplained'] for e in spent], '#cccccc')
+    figure.update_layout(
+        template='plotly_white',
+        barmode='relative',
+        height=180 + 60 * len(energies),
+        margin={'l': 20, 'r': 20, 't': 35, 'b': 45},
+        xaxis_title='energy of the last cycle (J)',
+        yaxis={'automargin': True, 'autorange': 'reversed'},
+    )
+    return figure
 
 
 def _timing_section(runs: Sequence[ReportedRun]) -> Iterable[str]:
