@@ -20,7 +20,7 @@ from fam_bundle_model.schema import declarations
 Columns = Mapping[str, Sequence[Any]]
 
 TRACKING = {'iae': ('IAE (s)', 1.0), 'max_error': ('maximum error (% strain)', PERCENT)}
-RIVAL_MARKERS = {'best_threshold': 'v', 'always_recruited': '^'}
+MARKERS = ('o', 's', 'D', '^', 'v', 'P', 'X', '*')
 RIVAL_COLOUR = '#555555'
 MISSING = {'facecolor': '#f2f2f2', 'edgecolor': '#bbbbbb', 'hatch': '////', 'linewidth': 0.0}
 ANNOTATED = 11  # cells side by side that leave room for their values
@@ -87,20 +87,23 @@ def axis_words(name: str) -> str:
 def tradeoff_figure(columns: Columns, schemes: Sequence[str], rivals: Sequence[str]) -> Figure:
     """Return IAE (s) and maximum error (% strain) of every case against its efficiency (%).
 
-    A large mark is the median of a scheme or rival over the cases that both have numbers for.
+    A large mark is the median of a scheme or rival over its cases, its bars from the first to
+    the third quartile.
     """
-    figure = Figure(figsize=(7.2, 3.9))
+    figure = Figure(figsize=(7.2, 4.1))
     panels = figure.subplots(1, 2)
+    names = [('', scheme) for scheme in schemes] + [(f'{rival}.', rival) for rival in rivals]
     for axes, (metric, (words, factor)) in zip(panels, TRACKING.items(), strict=True):
-        for rival in rivals:
-            x = PERCENT * _numbers(columns, f'{rival}.efficiency')
-            y = factor * _numbers(columns, f'{rival}.{metric}')
-            _draw_cloud(axes, x, y, _plain(rival), RIVAL_COLOUR, RIVAL_MARKERS.get(rival, 'x'))
-        for position, scheme in enumerate(schemes):
-            inside = _of_scheme(columns, scheme)
-            x = PERCENT * _numbers(columns, 'efficiency')[inside]
-            y = factor * _numbers(columns, metric)[inside]
-            _draw_cloud(axes, x, y, scheme, scheme_style(position)['color'], 'o')
+        for position, (prefix, name) in enumerate(names):
+            x = PERCENT * _numbers(columns, f'{prefix}efficiency')
+            y = factor * _numbers(columns, f'{prefix}{metric}')
+            inside = np.isfinite(x) & np.isfinite(y) & (y > 0.0)
+            colour, label = RIVAL_COLOUR, _plain(name)
+            if not prefix:
+                inside &= _of_scheme(columns, name)
+                colour, label = scheme_style(position)['color'], name
+            if inside.any():
+                _draw_cloud(axes, x[inside], y[inside], label, colour, position)
         axes.set_yscale('log')
         _plain_ticks(axes.yaxis)
         axes.set_xlabel('efficiency (%)')
@@ -108,11 +111,32 @@ def tradeoff_figure(columns: Columns, schemes: Sequence[str], rivals: Sequence[s
     figure.legend(
         *panels[0].get_legend_handles_labels(),
         loc='outside upper left',
-        ncols=min(len(schemes) + len(rivals), 4),
-        title='large: median of all cases',
+        ncols=min(len(names), 4),
+        title='small: one case; large: median and quartiles',
         alignment='left',
     )
     return figure
+
+
+def _draw_cloud(axes: Axes, x: Array, y: Array, label: str, colour: str, position: int) -> None:
+    marker = MARKERS[position % len(MARKERS)]
+    faint = min(0.35, 25.0 / len(x))
+    axes.scatter(x, y, s=8, color=colour, marker=marker, alpha=faint, linewidths=0)
+    (x25, x50, x75), (y25, y50, y75) = (np.percentile(values, (25, 50, 75)) for values in (x, y))
+    axes.plot([x25, x75], [y50, y50], color=colour, linewidth=1.0, zorder=3)
+    axes.plot([x50, x50], [y25, y75], color=colour, linewidth=1.0, zorder=3)
+    axes.scatter(
+        [x50],
+        [y50],
+        # Later ones lie on top: what they would hide looks out.
+        s=30 + 90 * 0.75**position,
+        color=colour,
+        marker=marker,
+        edgecolors='white',
+        linewidths=0.8,
+        label=label,
+        zorder=4,
+    )
 
 
 def _plain_ticks(axis: Any) -> None:
@@ -120,25 +144,6 @@ def _plain_ticks(axis: Any) -> None:
     axis.set_major_locator(ticker.LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
     axis.set_major_formatter(ticker.FormatStrFormatter('%g'))
     axis.set_minor_formatter(ticker.NullFormatter())
-
-
-def _draw_cloud(axes: Axes, x: Array, y: Array, label: str, colour: str, marker: str) -> None:
-    known = np.isfinite(x) & np.isfinite(y) & (y > 0.0)
-    if not known.any():
-        return
-    x, y = x[known], y[known]
-    axes.scatter(x, y, s=9, color=colour, marker=marker, alpha=0.35, linewidths=0)
-    axes.scatter(
-        [np.median(x)],
-        [np.median(y)],
-        s=80,
-        color=colour,
-        marker=marker,
-        edgecolors='white',
-        linewidths=1.2,
-        label=label,
-        zorder=3,
-    )
 
 
 # ---- Heat maps ----
