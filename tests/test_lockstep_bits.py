@@ -34,7 +34,10 @@ def test_graph_equals_one_process(
 def test_graph_equals_one_process_while_all_cores_are_busy(
     quick: Callable[..., Configuration], both_cores_busy: None, tmp_path: Path
 ) -> None:
-    configuration = quick('lag_pressure', allocation={'policy': 'force'})
+    configuration = quick(
+        recruitment={'scheme': 'lag_pressure', 'predictor': 'preview'},
+        allocation={'policy': 'force'},
+    )
     assert_same_bits(run_graph(configuration, tmp_path), run_offline(configuration))
 
 
@@ -42,8 +45,8 @@ def test_graph_equals_one_process_with_sensor_noise_and_three_units(
     quick: Callable[..., Configuration], tmp_path: Path
 ) -> None:
     configuration = quick(
-        'lag_pressure',
         fam={'count': [1, 1, 2]},
+        recruitment={'scheme': 'lag_pressure', 'predictor': 'sinusoid'},
         allocation={'policy': 'orderly'},
         pressure_loop={
             'proportional_gain': [3e-6, 3.5e-6, 7e-6],

@@ -17,13 +17,14 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from fam_bundle_bringup import replay_controllers
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_bringup.replay import run_replay
+from fam_bundle_io.bag import read_bag, trace_of
 from fam_bundle_io.bag_writer import BagError, BagFolder, Item, Topic
 from fam_bundle_model import bundle
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_sim import plant
 
 CONFIG = default_configuration()
-STATE, COMMAND = '/bundle_state', '/valve_command'
+STATE, COMMAND, RECRUITMENT = '/bundle_state', '/valve_command', '/recruitment_state'
 
 
 @pytest.fixture(scope='module', autouse=True)
@@ -121,6 +122,36 @@ def test_what_a_foreign_bag_lacks_is_named(
     bag = bag_of(tmp_path / 'bag', topics=damage.TOPICS | {topic: other})
     with pytest.raises(BagError, match=f'^{topic}: {words}$'):
         run_replay(bag, CONFIG, None)
+
+
+def test_a_bag_from_before_a_field_came_is_read_and_replayed(tmp_path: Path) -> None:
+    known = damage.TOPICS[RECRUITMENT]
+    before, _, after = known.definition.partition('# Error of the predictor')
+    rest = after.partition('float64 prediction_error\n')[2]
+    assert rest
+    topic = known._replace(definition=before + rest)
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(topic.definition, topic.type))
+    bag = BagFolder(tmp_path / 'bag')
+    for one in (damage.TOPICS | {RECRUITMENT: topic}).values():
+        bag.add_topic(one)
+    for item in damage.loop(range(50)):
+        data = item.data
+        if item.topic == RECRUITMENT:
+            message = damage.STORE.deserialize_cdr(data, topic.type)
+            data = bytes(store.serialize_cdr(message, topic.type))
+        bag.write(item._replace(data=data))
+    bag.close({})
+    run = trace_of(read_bag(tmp_path / 'bag'))
+    assert run.missing == {'prediction_error'}
+    assert 'recruitment_state: has no prediction_error' in run.warnings
+    assert np.isnan(run.trace['prediction_error']).all()
+    assert np.isfinite(run.trace['deslack_pressure']).all()
+    run_replay(tmp_path / 'bag', CONFIG, tmp_path / 'replay')
+    replayed = json.loads((tmp_path / 'replay' / 'replay.json').read_text())
+    signals = {one['signal'] for one in replayed['controllers']}
+    assert 'strain_rate' in signals
+    assert 'prediction_error' not in signals
 
 
 def test_text_for_a_number_is_refused(tmp_path: Path) -> None:

@@ -225,8 +225,10 @@ def recruitment_step(
         effective = attainable_pressure(law, units, recruited, *given)
         limit = modelled_strain(units, recruited, effective, load)
         saturation = time_to_rise(law.predictor, expected, reference, limit)
-        # A peak that is over before the unit is taut needs none.
-        lasts = stays_above(law.predictor, expected, reference, limit, lag.lag)
+        # A lag of never: filling the next unit would take pressure and give nothing. And a peak
+        # that is over before the unit is taut needs none.
+        if lag.lag < math.inf:
+            lasts = stays_above(law.predictor, expected, reference, limit, lag.lag)
     release = lag
     if recruited > 1 and may_fall(law.predictor, expected):
         newest_deslack = fam.deslack_pressure(units[newest].fam, strain)
@@ -242,8 +244,7 @@ def recruitment_step(
     armed = state.armed
     if law.lag_compensation:
         armed = armed or mu_pressure[newest] >= fam.deslack_pressure(units[newest].fam, strain)
-        # A lag of never: filling the next unit would take pressure and give nothing.
-        up = saturation <= lag.lag and lag.lag < math.inf and lasts
+        up = saturation <= lag.lag and lasts
         down = desaturation <= -release.lag and not comes_back
     else:
         armed = armed or mu_pressure[newest] > law.downshift_pressure
