@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fam_bundle_bringup.experiment import default_configuration
+from fam_bundle_bringup.experiment import default_configuration, metrics_of
 from fam_bundle_bringup.offline import run_offline
-from fam_bundle_io.energy import Energy, energy, energy_by_state, powers
+from fam_bundle_io.energy import Energy, energy, energy_by_state, powers, summary
 from fam_bundle_io.metrics import Window, ticks_in, time_at_source, time_in_state, whole_cycles
 from fam_bundle_io.trace import Trace, empty_trace
 from fam_bundle_model import fam
@@ -230,6 +230,18 @@ def test_a_sample_that_is_not_finite_spoils_its_own_cycle_only() -> None:
     assert energy(trace, found, cycle) == energies
     with pytest.raises(ValueError, match='not finite'):
         energy(trace, found, Window(0.0, 2.0))
+
+
+def test_metrics_hold_the_energy_unless_a_sensor_gave_no_number() -> None:
+    configuration, trace, energies, _ = settled(frequency=0.5)
+    found = metrics_of(configuration, 'offline', trace)['energy']
+    assert found == summary(energies)
+    lost = found['throttling_loss'] + energies.relieved + energies.unexplained
+    assert found['hydraulic_input'] == pytest.approx(found['output'] - found['returned'] + lost)
+    trace['source_flow'].fill(np.nan)
+    blind = metrics_of(configuration, 'offline', trace)
+    assert blind['energy'] is None
+    assert np.isfinite(blind['iae'])
 
 
 def test_parts_of_a_cycle_are_no_cycles() -> None:

@@ -15,8 +15,9 @@ from fam_bundle_bringup.graph import run_graph
 from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.completeness import ANSWERS
+from fam_bundle_io.energy import energy, powers, summary
 from fam_bundle_io.hardware.calibration import HardwareFile, write_hardware
-from fam_bundle_io.metrics import Tracking, shift_times, tracking
+from fam_bundle_io.metrics import Tracking, Window, shift_times, tracking
 from fam_bundle_io.trace import Trace, save_trace
 from fam_bundle_model.bundle import check_reachable, motor_units
 from fam_bundle_model.parameters import Configuration, load_configuration, write_yaml
@@ -105,6 +106,16 @@ def versions() -> dict[str, str]:
     return found
 
 
+def energy_of(
+    configuration: Configuration, trace: Trace, window: Window
+) -> dict[str, float | None] | None:
+    """Return what was spent within ``window``; None where a sensor gave no number."""
+    try:
+        return summary(energy(trace, powers(trace, configuration), window))
+    except ValueError:
+        return None
+
+
 def metrics_of(configuration: Configuration, pace: str, trace: Trace) -> dict[str, Any]:
     """Return what ``metrics.json`` holds."""
     start, stop = last_cycle(configuration)
@@ -115,6 +126,7 @@ def metrics_of(configuration: Configuration, pace: str, trace: Trace) -> dict[st
         'ticks': len(trace['time']),
         'upshift_times': up,
         'downshift_times': down,
+        'energy': energy_of(configuration, trace, Window(start, stop)),
         'metrics_from': start,
         'metrics_to': stop,
         'upshift_threshold': configuration.recruitment.upshift_threshold,

@@ -176,6 +176,17 @@ def energy(trace: Trace, found: Powers, window: Window, state: int | None = None
     )
 
 
+def summary(spent: Energy) -> dict[str, float | None]:
+    """Return the few numbers of ``spent`` that a run is compared by; an undefined one is None."""
+    return {
+        'hydraulic_input': spent.hydraulic_input,
+        'output': spent.output,
+        'returned': spent.returned,
+        'throttling_loss': sum(spent.supply_loss) + sum(spent.return_loss),
+        'efficiency': spent.efficiency if math.isfinite(spent.efficiency) else None,
+    }
+
+
 def energy_by_state(trace: Trace, found: Powers, window: Window) -> dict[int, Energy]:
     """Return ``energy`` of each number of recruited units that occurs within ``window``.
 
