@@ -132,6 +132,11 @@ class NodeFile:
             for call in ast.walk(tree)
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute)
         ]
+        self.made = [
+            call
+            for call in ast.walk(tree)
+            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name)
+        ]
         self.types = {
             alias.asname or alias.name: f'{node.module.replace(".", "/")}/{alias.name}'
             for node in ast.walk(tree)
@@ -171,6 +176,11 @@ class NodeFile:
                 for topic, message in zip(topics.keys, topics.values, strict=True):
                     found = self.types[message.id]
                     yield Connection(self.name, topic.value, found, direction, quality)
+
+    def actions(self) -> Iterator[tuple[str, str, str]]:
+        for call in self.made:
+            if call.func.id == 'TickedAction':
+                yield self.name, call.args[2].value, self.types[call.args[1].id]
 
     def services(self) -> Iterator[tuple[str, str, str]]:
         for call in self.calls:
@@ -267,6 +277,12 @@ def test_services_are_those_of_the_nodes(package: str) -> None:
     assert named == {service for node in node_files(package) for service in node.services()}
 
 
+@pytest.mark.parametrize('package', PACKAGES)
+def test_actions_are_those_of_the_nodes(package: str) -> None:
+    named = {tuple(row[:3]) for row in cells(readme(package), '## Actions')}
+    assert named == {action for node in node_files(package) for action in node.actions()}
+
+
 def test_quality_table_is_the_code() -> None:
     rows = cells(readme('fam_bundle_node'), '## Quality of service')
     assert {row[0]: row[1] for row in rows} == qualities()
@@ -296,8 +312,11 @@ def test_command_line_options() -> None:
 def test_message_package_names_its_files() -> None:
     rows = cells(MESSAGES / 'README.md', '## Messages')
     rows += cells(MESSAGES / 'README.md', '## Services')
+    rows += cells(MESSAGES / 'README.md', '## Actions')
     named = {LINK.search(row[0])[1] for row in rows}
-    files = {*MESSAGES.glob('msg/*.msg'), *MESSAGES.glob('srv/*.srv')}
+    files = {
+        path for kind in ('msg', 'srv', 'action') for path in MESSAGES.glob(f'{kind}/*.{kind}')
+    }
     assert named == {str(path.relative_to(MESSAGES)) for path in files}
     assert all(link_texts(row[0]) == [Path(LINK.search(row[0])[1]).stem] for row in rows)
 
@@ -312,7 +331,8 @@ def test_message_package_names_the_topics_that_are_published() -> None:
         if c.direction == 'out' and c.message.startswith('fam_bundle_msgs/')
     }
     rows = cells(MESSAGES / 'README.md', '## Messages')
-    named = {(link_texts(row[0])[0], row[1].split(' ')[0]) for row in rows}
+    ours = [row for row in rows if row[2] != 'from outside']
+    named = {(link_texts(row[0])[0], row[1].split(' ')[0]) for row in ours}
     assert {(m, topic) for m, topic in named if topic != 'inside'} == published
 
 

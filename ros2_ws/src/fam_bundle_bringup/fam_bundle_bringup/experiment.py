@@ -20,7 +20,12 @@ from fam_bundle_io.hardware.calibration import HardwareFile, write_hardware
 from fam_bundle_io.metrics import Tracking, Window, shift_times, tracking
 from fam_bundle_io.trace import Trace, save_trace
 from fam_bundle_model.bundle import check_reachable, motor_units
-from fam_bundle_model.parameters import Configuration, load_configuration, write_yaml
+from fam_bundle_model.parameters import (
+    Configuration,
+    check_period,
+    load_configuration,
+    write_yaml,
+)
 from fam_bundle_model.schema import ConfigurationError
 
 PACES = ('lockstep', 'realtime', 'offline')
@@ -58,19 +63,13 @@ def check_feasible(configuration: Configuration) -> None:
     """Raise ConfigurationError, naming parameter, value and bound, unless the rig can run it."""
     check_reachable(configuration, motor_units(configuration))
     check_length(configuration)
-    return configuration
 
 
 def check_length(configuration: Configuration) -> None:
     """Raise ConfigurationError where a run has too few ticks for its reference, or too many."""
     period, ticks = configuration.simulation.period, configuration.ticks()
     reference = configuration.reference
-    highest = max(reference.highest_frequency(), 1.0 / configuration.duration())
-    if period > 0.5 / highest:
-        raise ConfigurationError(
-            f'simulation.period = {period:g} s: must be <= {0.5 / highest:g} s, half a cycle of '
-            'the reference'
-        )
+    check_period(reference, period)
     if ticks > LARGEST_RUN:
         given = f'reference.cycles = {reference.cycles}'
         bound = f'{LARGEST_RUN * reference.cycles // ticks}'

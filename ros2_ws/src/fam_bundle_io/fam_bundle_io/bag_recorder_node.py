@@ -163,7 +163,10 @@ class BagRecorder(Node):
         space = self.get_namespace().rstrip('/')
         for pattern in self._patterns:
             whole = pattern if pattern.startswith('/') else f'{space}/{pattern}'
-            if name == whole or (fnmatch.fnmatchcase(name, whole) and name not in NOBODYS):
+            if name == whole:
+                return True
+            nobodys = name in NOBODYS or '/_' in name  # those of an action are hidden
+            if fnmatch.fnmatchcase(name, whole) and not nobodys:
                 return True
         return False
 

@@ -514,6 +514,16 @@ def check_samples(reference: ReferenceParameters) -> None:
             )
 
 
+def check_period(reference: ReferenceParameters, period: float) -> None:
+    """Raise ConfigurationError where ticks of ``period`` s are too far apart for a reference."""
+    highest = max(reference.highest_frequency(), 1.0 / reference.duration())
+    if period > 0.5 / highest:
+        raise ConfigurationError(
+            f'simulation.period = {period:g} s: must be <= {0.5 / highest:g} s, half a cycle of '
+            'the reference'
+        )
+
+
 def step_time(distance: float, rate: float, acceleration: float) -> float:
     """Return the shortest time in s from rest to rest over ``distance`` within both limits."""
     if distance < rate * rate / acceleration:

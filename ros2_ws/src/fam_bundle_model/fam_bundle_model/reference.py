@@ -19,6 +19,7 @@ from fam_bundle_model.compile import compiled
 from fam_bundle_model.parameters import ReferenceParameters, step_time
 
 Array = npt.NDArray[np.float64]
+Floats = float | Array
 
 ORDER = 6  # coefficients of a piece
 FINENESS = 33  # points at which a piece is looked at for its extremes
@@ -146,7 +147,8 @@ def _minimum_jerk(p: ReferenceParameters) -> Reference:
     Flash and Hogan, The Coordination of Arm Movements, J. Neurosci. 5(7), 1985.
     """
     share, moves = _levels(p)
-    rows = [quintic(start, 0.0, stop, 0.0, share) for start, stop in moves]
+    starts, stops = np.array(moves).T
+    rows = quintic(starts, 0.0, stops, 0.0, share)
     breaks = [k * share for k in range(len(rows))]
     return _pieces(breaks, rows, p.duration(), 1.0 / p.frequency)
 
@@ -187,8 +189,8 @@ _KINDS: dict[str, Callable[[ReferenceParameters], Reference]] = {
 
 
 def _pieces(
-    breaks: Sequence[float],
-    rows: Sequence[Sequence[float]],
+    breaks: Sequence[float] | Array,
+    rows: Sequence[Sequence[float]] | Array,
     end: float,
     cycle: float = math.inf,
 ) -> Reference:
@@ -198,10 +200,8 @@ def _pieces(
     return Reference(0.0, end, cycle, np.zeros((0, 3)), np.array(breaks, float), coefficients)
 
 
-def quintic(
-    start: float, rate: float, stop: float, final_rate: float, taken: float
-) -> list[float]:
-    """Return the coefficients of the way of least jerk that takes ``taken`` s.
+def quintic(start: Floats, rate: Floats, stop: Floats, final_rate: Floats, taken: Floats) -> Array:
+    """Return the coefficients of the way of least jerk that takes ``taken`` s: (..., 6).
 
     From strain ``start`` to ``stop`` at the strain rates ``rate`` and ``final_rate`` (1/s) without
     acceleration at either end.
@@ -209,7 +209,9 @@ def quintic(
     left = stop - start - rate * taken
     gain = (final_rate - rate) * taken
     third, fourth, fifth = 10 * left - 4 * gain, 7 * gain - 15 * left, 6 * left - 3 * gain
-    return [start, rate, 0.0, third / taken**3, fourth / taken**4, fifth / taken**5]
+    bend = 0.0 * left
+    row = (start, rate, bend, third / taken**3, fourth / taken**4, fifth / taken**5)
+    return np.stack(np.broadcast_arrays(*row), axis=-1)
 
 
 def smooth(times: Sequence[float], strains: Sequence[float]) -> Reference:
@@ -221,17 +223,14 @@ def smooth(times: Sequence[float], strains: Sequence[float]) -> Reference:
     rates a and b at its ends, has the Bernstein coefficients a, a, 5 - 2 a - 2 b, b, b: none is
     negative, for a and b are at most 1.
     """
-    slopes = np.diff(strains) / np.diff(times)
-    before, after = slopes[:-1], slopes[1:]
-    passing = np.where(np.abs(before) < np.abs(after), before, after)
-    passing[before * after <= 0.0] = 0.0
-    rates = [0.0, *passing.tolist(), 0.0]
-    rows = [
-        quintic(strains[k], rates[k], strains[k + 1], rates[k + 1], times[k + 1] - times[k])
-        for k in range(len(times) - 1)
-    ]
-    breaks = np.array(times, float)[:-1] - times[0]
-    law = _pieces(breaks.tolist(), rows, times[-1] - times[0])
+    points, parts = np.array(strains, float), np.diff(times)
+    slopes = np.diff(points) / parts
+    before, beyond = slopes[:-1], slopes[1:]
+    passing = np.where(np.abs(before) < np.abs(beyond), before, beyond)
+    passing[before * beyond <= 0.0] = 0.0
+    rates = np.concatenate(([0.0], passing, [0.0]))
+    rows = quintic(points[:-1], rates[:-1], points[1:], rates[1:], parts)
+    law = _pieces(np.array(times[:-1]) - times[0], rows, times[-1] - times[0])
     return law._replace(start=times[0])
 
 
@@ -270,7 +269,7 @@ def after(
     least = step_time(abs(stop - start), rate, acceleration)
     taken = max(least, abs(present) / acceleration, SHORTEST)
     while True:
-        way = np.array(quintic(start, present, stop, 0.0, taken))
+        way = quintic(start, present, stop, 0.0, taken)
         fastest = _largest(np.polynomial.polynomial.polyder(way), taken)
         hardest = _largest(np.polynomial.polynomial.polyder(way, 2), taken)
         if fastest <= max(rate, abs(present)) and hardest <= acceleration:
@@ -310,6 +309,6 @@ def _preceded(wanted: Reference, time: float, taken: float, way: Array) -> Refer
     )
 
 
-def _largest(coefficients: Array, until: float) -> float:
+def _largest(coefficients: npt.NDArray[np.floating], until: float) -> float:
     times = np.linspace(0.0, until, FINENESS)
     return float(np.abs(np.polynomial.polynomial.polyval(times, coefficients)).max())

@@ -28,3 +28,5 @@ REALTIME_SUBSCRIPTION = _reliable(100, DurabilityPolicy.TRANSIENT_LOCAL)
 RECORDER_SUBSCRIPTION = _reliable(5 * WRITER_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
 REPORTS = _reliable(10, DurabilityPolicy.VOLATILE)
 LATCHED = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
+# From outside, by whatever tool: transient local would refuse what most of them offer.
+NEWEST = _reliable(1, DurabilityPolicy.VOLATILE)

@@ -1,0 +1,361 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The strain controller's own reference: goals, live values, and the latched law.
+
+The node runs in this process beside a bundle that is perfect: its strain is the reference of the
+tick before. Times are those of the run.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from action_msgs.msg import GoalStatus
+from action_msgs.srv import CancelGoal
+from rclpy.action import ActionClient
+from rclpy.executors import Executor
+from rclpy.node import Node
+
+from fam_bundle_bringup.experiment import default_configuration
+from fam_bundle_bringup.graph import own_domain
+from fam_bundle_control.strain_controller_node import StrainController
+from fam_bundle_model.parameters import Configuration, load_configuration, write_yaml
+from fam_bundle_model.reference import reference_law, strain_reference
+from fam_bundle_msgs.action import TrackStrain
+from fam_bundle_msgs.msg import BundleState, PressureReference, Reference, StrainReference
+from fam_bundle_node.qos import LATCHED, LOOP_PUBLISHER, LOOP_SUBSCRIPTION, NEWEST
+from fam_bundle_node.reference_message import from_message, to_message
+from fam_bundle_node.run import make_executor
+
+PERIOD = 1e-3
+PATIENCE = 30.0  # s
+SLOW = {'strain_rate': 0.2, 'strain_acceleration': 4.0}
+
+
+class Bundle(Node):
+    """Publishes the next tick when the one before is answered, up to ``until``."""
+
+    def __init__(self) -> None:
+        super().__init__('bundle')
+        self.references: list[float] = []
+        self.laws: list[Reference] = []
+        self.until = 0
+        self.out = self.create_publisher(BundleState, 'bundle_state', LOOP_PUBLISHER)
+        self.live = self.create_publisher(StrainReference, 'strain_reference', NEWEST)
+        self.create_subscription(
+            PressureReference, 'pressure_reference', self.answered, LOOP_SUBSCRIPTION
+        )
+        self.create_subscription(Reference, 'reference', self.laws.append, LATCHED)
+        self.client = ActionClient(self, TrackStrain, 'track_strain')
+
+    def begin(self) -> None:
+        """Begin a new run."""
+        self.references.clear()
+        self.publish(0)
+
+    def publish(self, tick: int) -> None:
+        strain = self.references[-1] if self.references else 0.0
+        message = BundleState(tick=tick, strain=strain, source_pressure=6.8e5)
+        nanoseconds = tick * 1_000_000
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
+        message.mu_pressure = [1e5, 0.0]
+        self.out.publish(message)
+
+    def answered(self, answer: PressureReference) -> None:
+        assert answer.tick == len(self.references)
+        self.references.append(answer.strain_reference)
+        if len(self.references) < self.until:
+            self.publish(len(self.references))
+
+
+class Rig:
+    """The two nodes on one executor."""
+
+    def __init__(self, executor: Executor, controller: StrainController, bundle: Bundle) -> None:
+        self.executor, self.controller, self.bundle = executor, controller, bundle
+
+    def spin(self, done: Callable[[], bool]) -> None:
+        waits = rclpy.task.Future()
+        for _ in range(int(PATIENCE / 0.02)):
+            if done():
+                return
+            self.executor.spin_until_future_complete(waits, timeout_sec=0.02)
+        raise AssertionError('nothing came')
+
+    def run(self, seconds: float) -> None:
+        """Let so much time of the run pass."""
+        bundle = self.bundle
+        bundle.until = len(bundle.references) + round(seconds / PERIOD)
+        if bundle.references:
+            bundle.publish(len(bundle.references))
+        else:
+            bundle.begin()
+        self.spin(lambda: len(bundle.references) >= bundle.until)
+
+    def send(self, feedback: Callable[[Any], None] | None = None, **goal: Any) -> Any:
+        """Send a goal and return its handle."""
+        self.spin(self.bundle.client.server_is_ready)
+        sent = self.bundle.client.send_goal_async(TrackStrain.Goal(**goal), feedback)
+        self.spin(sent.done)
+        return sent.result()
+
+    def connect_live(self) -> None:
+        """Send a value that changes nothing until one has come through."""
+        laws = self.bundle.laws
+
+        def heard() -> bool:
+            self.bundle.live.publish(StrainReference(strain=0.0))
+            return len(laws) > 1
+
+        self.spin(heard)
+        self.run(0.05)  # for those under way
+        del laws[1:]
+
+    def end_of(self, handle: Any) -> tuple[int, Any]:
+        """Return status and result of a goal that has come to its end."""
+        wrapped = handle.get_result_async()
+        self.spin(wrapped.done)
+        return wrapped.result().status, wrapped.result().result
+
+
+def time_of(tick: int) -> float:
+    """Return the time in s of a tick as nodes have it, from whole nanoseconds."""
+    return tick * 1_000_000 / 1e9
+
+
+def configured(**reference: Any) -> Configuration:
+    values = {'kind': 'sine', 'frequency': 0.5, 'cycles': 4, **reference}
+    return load_configuration(default_configuration(), {'reference': values})
+
+
+@pytest.fixture
+def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
+    """Return the rig with a configured reference, and an executor, of the test's choice."""
+    reference, kind = getattr(request, 'param', ({}, 'events'))
+    parameter_file = tmp_path / 'parameters.yaml'
+    write_yaml(configured(**reference), parameter_file)
+    with own_domain():
+        rclpy.init(args=['--ros-args', '--params-file', str(parameter_file)])
+        executor = make_executor(kind)
+        controller, bundle = StrainController(), Bundle()
+        try:
+            executor.add_node(controller)
+            executor.add_node(bundle)
+            yield Rig(executor, controller, bundle)
+        finally:
+            controller.close()
+            executor.shutdown()
+            bundle.destroy_node()
+            controller.destroy_node()
+            rclpy.try_shutdown()
+
+
+def both_executors(**reference: Any) -> pytest.MarkDecorator:
+    kinds = ('events', 'single_threaded')
+    return pytest.mark.parametrize('rig', [(reference, kind) for kind in kinds], indirect=True)
+
+
+def live() -> pytest.MarkDecorator:
+    reference = {'kind': 'topic', 'strain_rate': 0.1}
+    return pytest.mark.parametrize('rig', [(reference, 'events')], indirect=True)
+
+
+def assert_no_jump(references: list[float], rate: float = 0.2) -> None:
+    assert np.abs(np.diff(references)).max() <= rate * PERIOD * (1 + 1e-6)
+
+
+# ---- The action ----
+
+
+@both_executors()
+def test_a_goal_begins_without_a_jump_and_ends_with_its_score(rig: Rig) -> None:
+    rig.run(0.7)
+    told: list[Any] = []
+    goal = {'kind': 'minimum_jerk', 'amplitude': 0.03, 'frequency': 2.0, 'cycles': 1, **SLOW}
+    handle = rig.send(lambda message: told.append(message.feedback), **goal)
+    assert handle.accepted
+    start = from_message(rig.bundle.laws[-1]).start
+    assert start > 0.7
+    rig.run(start + 0.6 - 0.7)
+    status, result = rig.end_of(handle)
+    assert (status, result.message) == (GoalStatus.STATUS_SUCCEEDED, '')
+
+    references = np.array(rig.bundle.references)
+    assert_no_jump(references.tolist(), 1.875 * 0.03 / 0.125)  # of least jerk, to the next level
+    law = reference_law(configured(**goal).reference)
+    wanted = [strain_reference(law, k * PERIOD - start) for k in range(len(references))]
+    after = np.arange(len(references)) * PERIOD >= start
+    assert references[after] == pytest.approx(np.array(wanted)[after], abs=1e-12)
+    # The bundle is one tick behind: the error is the step of the reference.
+    inside = after & (np.arange(len(references)) * PERIOD < start + 0.5)
+    error = np.abs(np.diff(references, prepend=0.0))[inside]
+    assert result.samples == error.size
+    assert result.iae == pytest.approx(error.sum() * PERIOD)
+    assert result.max_error == pytest.approx(error.max())
+    rig.spin(lambda: len(told) >= 5)
+    assert told[0].time < 0.0 < told[-1].time, 'first the way to it, then the waveform'
+    assert np.diff([f.time for f in told]) == pytest.approx(0.05, abs=1.01 * PERIOD)
+    assert all(abs(f.error) <= 0.45 * PERIOD for f in told)
+
+
+def test_a_cancelled_goal_goes_back_smoothly_before_it_is_cancelled(rig: Rig) -> None:
+    rig.run(0.1)
+    handle = rig.send(kind='sine', amplitude=0.05, frequency=0.2, cycles=2, **SLOW)
+    rig.run(1.5)
+    before = rig.bundle.references[-1]
+    assert before > 0.02
+    cancelled = handle.cancel_goal_async()
+    rig.spin(cancelled.done)
+    assert cancelled.result().return_code == CancelGoal.Response.ERROR_NONE
+    rig.run(0.05)
+    assert rig.bundle.references[-1] > before, 'it goes on where it was going, and slows down'
+    assert rig.bundle.laws[-1].kind == 'return'
+    assert not rig.send(kind='ramp').accepted, 'while another is on its way back'
+    rig.run(1.5)
+    status, result = rig.end_of(handle)
+    assert status == GoalStatus.STATUS_CANCELED
+    assert 1000 < result.samples < 1600, 'the way back is not scored'
+    assert rig.bundle.references[-1] == pytest.approx(0.0, abs=1e-12)
+    assert_no_jump(rig.bundle.references)
+    assert np.abs(np.diff(rig.bundle.references, 2))[200:].max() <= 4.0 * PERIOD**2 * 1.01
+
+
+def test_what_cannot_be_tracked_is_rejected_and_disturbs_nothing(
+    rig: Rig, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert not rig.send(kind='sine').accepted
+    rig.run(0.1)
+    for goal, reason in (
+        ({'kind': 'square'}, 'reference.kind = square: must be one of sine'),
+        ({'kind': 'topic'}, 'reference.kind = topic: must be another in a goal'),
+        ({'amplitude': 0.1}, 'goal: its peak strain 0.2 must be <= 0.1505'),
+        ({'amplitude': math.nan}, 'reference.amplitude = nan: must be >= 0 and <= 0.15'),
+        ({'kind': 'samples'}, 'reference.times: 1 samples; must be >= 2'),
+        (
+            {'kind': 'samples', 'times': [0.0, 1.0], 'strains': [0.0, -0.09]},
+            'goal: its lowest strain -0.09 must be >= -0.0',
+        ),
+        (
+            {'kind': 'samples', 'times': [0.1 * k for k in range(1001)]},
+            'reference.times: 1001 values; must be <= 1000 in a goal',
+        ),
+        ({'kind': 'random', 'cycles': 501}, 'reference.cycles = 501: must be <= 500'),
+        ({'kind': 'sum_of_sines', 'multiples': [1000.0], 'frequency': 9.0}, 'must be 1 or 1'),
+        ({'kind': 'steps', 'strain_rate': 1e-3}, 'reference.levels: a step of '),
+    ):
+        assert not rig.send(**goal).accepted, goal
+        said = capfd.readouterr().err
+        assert 'track_strain: ' in said
+        assert reason in said
+    rig.run(0.2)
+    law = reference_law(configured().reference)
+    expected = [strain_reference(law, time_of(k)) for k in range(300)]
+    assert rig.bundle.references == expected
+    assert len(rig.bundle.laws) == 1
+
+
+def test_a_second_goal_waits_for_the_first_and_then_sets_in_where_that_ended(rig: Rig) -> None:
+    rig.run(0.05)
+    quick = {'frequency': 2.0, 'cycles': 1, **SLOW}
+    first = rig.send(kind='ramp', amplitude=0.02, **quick)
+    assert not rig.send(kind='ramp', amplitude=0.03, **quick).accepted
+    rig.run(1.0)
+    assert rig.end_of(first)[0] == GoalStatus.STATUS_SUCCEEDED
+    assert rig.bundle.references[-1] == pytest.approx(0.04)
+    held = {'kind': 'samples', 'times': [0.0, 0.2], 'strains': [0.05, 0.06], **SLOW}
+    second = rig.send(**held)
+    rig.run(1.0)
+    assert rig.end_of(second)[0] == GoalStatus.STATUS_SUCCEEDED
+    assert rig.bundle.references[-1] == pytest.approx(0.06)
+    assert_no_jump(rig.bundle.references)
+
+
+def test_a_new_run_ends_a_goal_and_begins_with_the_configured_reference(rig: Rig) -> None:
+    rig.run(0.3)
+    handle = rig.send(kind='sine', amplitude=0.05, **SLOW)
+    rig.run(0.2)
+    rig.bundle.until = 100
+    rig.bundle.begin()
+    rig.spin(lambda: len(rig.bundle.references) == 100)
+    status, result = rig.end_of(handle)
+    assert (status, result.message) == (GoalStatus.STATUS_ABORTED, 'a new run began')
+    law = reference_law(configured().reference)
+    assert rig.bundle.references == [strain_reference(law, time_of(k)) for k in range(100)]
+    rig.spin(lambda: [law.kind for law in rig.bundle.laws] == ['sine', 'goal', 'sine'])
+
+
+# ---- Live values ----
+
+
+@live()
+def test_live_values_are_held_and_approached_at_the_limited_rate(rig: Rig) -> None:
+    rig.run(0.1)
+    rig.connect_live()
+    assert set(rig.bundle.references) == {0.0}, 'no message: hold'
+    start = len(rig.bundle.references) - 1
+    rig.bundle.live.publish(StrainReference(strain=0.03))
+    rig.spin(lambda: len(rig.bundle.laws) == 2)
+    rig.run(0.5)
+    moved = np.diff(rig.bundle.references)
+    assert moved.max() == pytest.approx(0.1 * PERIOD)
+    assert rig.bundle.references[start + 150] == pytest.approx(0.015)
+    assert set(rig.bundle.references[-150:]) == {0.03}, 'it is held'
+
+
+@live()
+def test_live_values_that_cannot_be_are_not_taken(
+    rig: Rig, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rig.run(0.05)
+    rig.connect_live()
+    for strain in (math.nan, math.inf, -math.inf, 0.2, -0.1, 1e300):
+        rig.bundle.live.publish(StrainReference(strain=strain))
+        rig.run(0.05)
+    assert set(rig.bundle.references) == {0.0}
+    assert len(rig.bundle.laws) == 1
+    said = capfd.readouterr().err
+    assert 'strain_reference: strain = nan: must be >= -0.0' in said
+    assert said.count('not taken') == 1, 'once a second'
+    rig.bundle.live.publish(StrainReference(strain=0.001))
+    rig.spin(lambda: len(rig.bundle.laws) == 2)
+
+
+# ---- The latched law ----
+
+
+@pytest.mark.parametrize('kind', ['sine', 'steps', 'random', 'chirp'])
+def test_a_law_survives_its_message_to_the_bit(kind: str) -> None:
+    law = reference_law(configured(kind=kind, strain_rate=0.5).reference)
+    again = from_message(to_message(law, kind))
+    assert again[:3] == law[:3]
+    for one, other in zip(again[3:], law[3:], strict=True):
+        assert one.tobytes() == other.tobytes()
+        assert (one.shape, one.dtype) == (other.shape, other.dtype)
+
+
+@pytest.mark.parametrize('field', ['sines', 'breaks', 'coefficients'])
+def test_a_law_whose_parts_do_not_fit_is_refused(field: str) -> None:
+    message = to_message(reference_law(configured().reference), 'sine')
+    setattr(message, field, [*getattr(message, field), 1.0])
+    with pytest.raises(ValueError, match='cannot reshape'):
+        from_message(message)
+    with pytest.raises(ValueError, match='no polynomial'):
+        from_message(Reference())
+
+
+def test_every_reference_of_a_run_follows_from_the_latched_laws(rig: Rig) -> None:
+    """Each holds for the ticks after its stamp, the first from the start."""
+    rig.run(0.2)
+    first = rig.send(kind='sine', amplitude=0.03, frequency=1.0, **SLOW)
+    rig.run(0.8)
+    rig.spin(first.cancel_goal_async().done)
+    rig.run(1.0)
+    rig.spin(lambda: len(rig.bundle.laws) == 3)
+    laws = [(m.header.stamp.nanosec * 1e-9 + m.header.stamp.sec, m) for m in rig.bundle.laws]
+    for tick, reference in enumerate(rig.bundle.references):
+        time = time_of(tick)
+        message = [m for stamp, m in laws if stamp < time or m is laws[0][1]][-1]
+        assert strain_reference(from_message(message), time) == reference
