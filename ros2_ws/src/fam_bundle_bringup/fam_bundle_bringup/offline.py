@@ -27,6 +27,7 @@ from fam_bundle_control.strain_loop import (
     strain_loop_step,
 )
 from fam_bundle_io.trace import Trace, empty_trace
+from fam_bundle_model.bundle import MotorUnit, motor_units
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.lag_table import LagTable, cached_lag_table
 from fam_bundle_model.parameters import Configuration, seconds
@@ -46,6 +47,7 @@ BLOCK = 5000  # ticks between two reports of progress
 @compiled
 def run_block(
     rig: Plant,
+    units: tuple[MotorUnit, ...],
     instruments: Sensors,
     outer: StrainLoop,
     inner: PressureLoop,
@@ -67,17 +69,18 @@ def run_block(
 ) -> tuple[StrainLoopState, RecruitmentState]:
     """Run one tick for each of ``times`` and fill ``references`` and the rows of the trace.
 
-    ``plant_state`` and ``integral`` are advanced in place, the other states returned.
+    ``units`` are those that the laws believe in. ``plant_state`` and ``integral`` are advanced in
+    place, the other states returned.
     """
-    units = integral.shape[0]
-    wanted, saturated = np.empty(units), np.empty(units, dtype=np.bool_)
+    count = integral.shape[0]
+    wanted, saturated = np.empty(count), np.empty(count, dtype=np.bool_)
     for k in range(times.shape[0]):
         pressure, spool, row = mu_pressures[k], spools[k], rows[k]
         seen = measure(instruments, truth(rig, plant_state, pressure), noise[k], pressure)
         references[k] = strain_reference(trajectory, times[k])
         outer_state, asked = strain_loop_step(
             outer,
-            rig.units,
+            units,
             outer_state,
             references[k],
             seen.strain,
@@ -87,7 +90,7 @@ def run_block(
         )
         policy_state, decided = recruitment_step(
             policy,
-            rig.units,
+            units,
             table,
             trajectory,
             policy_state,
@@ -100,7 +103,7 @@ def run_block(
         )
         pressure_loop_step(
             inner,
-            rig.units,
+            units,
             integral,
             decided.recruited,
             asked.pressure,
@@ -150,23 +153,27 @@ def run_offline(
     configuration: Configuration,
     progress: Callable[[int], None] | None = None,
     table: LagTable | None = None,
+    actual: Configuration | None = None,
 ) -> Trace:
     """Return the trace of the whole run of ``configuration``.
 
     ``progress`` is called with the ticks done so far; ``table`` spares the look-up of the lag
-    table where the caller has it already. Raises RunFailed when the plant diverges.
+    table where the caller has it already. With ``actual`` plant and sensors are those of another
+    configuration than the laws believe in. Raises RunFailed when the plant diverges.
     """
     units, ticks = len(configuration.fam.count), configuration.ticks()
     simulation, step = configuration.simulation, configuration.period_ns()
-    rig = plant(configuration)
-    plant_state = resting_state(configuration, rig)
+    there = configuration if actual is None else actual
+    rig = plant(there)
+    plant_state = resting_state(there, rig)
     integral = np.zeros(units)
     outer_state, policy_state = strain_loop_start(), recruitment_start()
-    samples = noise_samples(configuration.sensors, units)
+    samples = noise_samples(there.sensors, units)
     trace = empty_trace(ticks, units)
     laws = (
         rig,
-        sensors(configuration.sensors, units),
+        rig.units if actual is None else motor_units(configuration),
+        sensors(there.sensors, units),
         strain_loop(configuration),
         pressure_loop(configuration),
         recruitment(configuration),
