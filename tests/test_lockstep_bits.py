@@ -58,3 +58,15 @@ def test_graph_equals_one_process_with_sensor_noise_and_three_units(
     assert trace['mu_pressure'].shape == (4000, 3)
     assert np.unique(trace['recruitment_state']).size > 1, 'the run must contain a shift'
     assert_same_bits(trace, run_offline(configuration))
+
+
+def test_graph_equals_one_process_on_a_reference_of_polynomials(
+    quick: Callable[..., Configuration], tmp_path: Path
+) -> None:
+    """A harmonic one is that of the other tests."""
+    samples = {'kind': 'samples', 'times': [0.0, 0.4, 0.9, 1.3], 'strains': [0.0, 0.03, 0.11, 0.1]}
+    configuration = quick('lag_pressure', reference=samples)
+    trace = run_graph(configuration, tmp_path)
+    assert len(trace['time']) == 1300
+    assert trace['recruitment_state'].max() == 2, 'the run must contain a shift'
+    assert_same_bits(trace, run_offline(configuration))
