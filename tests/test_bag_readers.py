@@ -20,7 +20,7 @@ from fam_bundle_model.parameters import Configuration
 
 NPM_READER = Path(__file__).parent / 'readers' / 'read.mjs'
 EACH_TICK = ('/bundle_state', '/pressure_reference', '/recruitment_state', '/valve_command')
-TOPICS = {*EACH_TICK, '/lag_table', '/loop_statistics', '/diagnostics'}
+TOPICS = {*EACH_TICK, '/lag_table', '/reference', '/loop_statistics', '/diagnostics'}
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4  # kinds of fields in rosbags' type system
 DTYPES = {'f': 'float64', 'b': 'bool', 'i': 'int64', 'u': 'uint64', 'O': 'string'}
 INFINITY = '7ff0000000000000'
