@@ -89,6 +89,24 @@ class PredictorState(NamedTuple):
     error: float
 
 
+class Course(NamedTuple):
+    """The way ahead: what of a state it follows from; numbers only, to be looked at often.
+
+    ``reference`` is the reference strain now.
+    """
+
+    kind: int
+    time: float
+    reference: float
+    strain: float
+    rate: float
+    position: float
+    velocity: float
+    acceleration: float
+    frequency: float
+    weight: float
+
+
 def predictor(configuration: Configuration) -> Predictor:
     """Return the predictor of ``configuration``; a live reference has no preview."""
     p = configuration.recruitment
@@ -193,34 +211,65 @@ def predictor_step(
     )
     if row >= 0:
         rows = forecasts.rows
-        rows[row, 1 + EXPECTED] = expected_strain(law, new, reference, law.horizon)
-        rows[row, 1 + SIMPLY] = simply_expected(law, new, law.horizon)
-        rows[row, 1 + MODELLED] = modelled(law, new, reference, law.horizon)
+        course = course_of(law, new, reference)
+        then = strain_reference(reference, time + law.horizon)
+        rows[row, 1 + EXPECTED] = weighed(course, then, law.horizon)
+        rows[row, 1 + SIMPLY] = simply_expected(course, law.horizon)
+        rows[row, 1 + MODELLED] = modelled(course, then, law.horizon)
     return new
 
 
 @compiled
-def simply_expected(law: Predictor, state: PredictorState, ahead: float) -> float:
+def course_of(law: Predictor, state: PredictorState, reference: Reference) -> Course:
+    """Return what a state says of the way ahead."""
+    return Course(
+        law.kind,
+        state.time,
+        strain_reference(reference, state.time),
+        state.strain,
+        state.strain_rate,
+        state.position,
+        state.velocity,
+        state.acceleration,
+        state.sinusoid.frequency,
+        state.weight,
+    )
+
+
+@compiled
+def simply_expected(course: Course, ahead: float) -> float:
     """Return the strain ``ahead`` s from now without a model, at constant rate.
 
     Where the reference is known it tells the rate: the strain stands still without it.
     """
-    return state.position if law.kind == PREVIEW else state.strain + state.strain_rate * ahead
+    return course.position if course.kind == PREVIEW else course.strain + course.rate * ahead
 
 
 @compiled
-def modelled(law: Predictor, state: PredictorState, reference: Reference, ahead: float) -> float:
-    """Return the strain ``ahead`` s from now by the reference, the parabola or the sinusoid."""
-    if law.kind == PREVIEW:
-        now = strain_reference(reference, state.time)
-        coming = strain_reference(reference, state.time + ahead) - now
+def modelled(course: Course, then: float, ahead: float) -> float:
+    """Return the strain ``ahead`` s from now by the reference, the parabola or the sinusoid.
+
+    ``then`` is the reference strain at that time.
+    """
+    if course.kind == PREVIEW:
         caught_up = 1.0 - math.exp(-ahead / TRACKING_TIME_CONSTANT)
-        return state.position + coming + caught_up * (now - state.position)
-    if law.kind == SINUSOID:
-        return state.position + sinusoid_ahead(state.sinusoid, ahead)
+        left = course.reference - course.position
+        return course.position + then - course.reference + caught_up * left
+    if course.kind == SINUSOID:
+        rise = sinusoid_ahead(course.velocity, course.acceleration, course.frequency, ahead)
+        return course.position + rise
     lasts = min(ahead, REACH)
-    bend = state.acceleration * lasts * (ahead - 0.5 * lasts)
-    return state.position + state.velocity * ahead + bend
+    bend = course.acceleration * lasts * (ahead - 0.5 * lasts)
+    return course.position + course.velocity * ahead + bend
+
+
+@compiled
+def weighed(course: Course, then: float, ahead: float) -> float:
+    """Return the strain ``ahead`` s from now by both; ``then`` as in ``modelled``."""
+    simply = simply_expected(course, ahead)
+    if course.kind == CONSTANT_RATE:
+        return simply
+    return simply + course.weight * (modelled(course, then, ahead) - simply)
 
 
 @compiled
@@ -228,10 +277,8 @@ def expected_strain(
     law: Predictor, state: PredictorState, reference: Reference, ahead: float
 ) -> float:
     """Return the strain expected ``ahead`` s from now: equation 14 at constant rate."""
-    simply = simply_expected(law, state, ahead)
-    if law.kind == CONSTANT_RATE:
-        return simply
-    return simply + state.weight * (modelled(law, state, reference, ahead) - simply)
+    then = strain_reference(reference, state.time + ahead)
+    return weighed(course_of(law, state, reference), then, ahead)
 
 
 @compiled
@@ -294,18 +341,23 @@ def stays_above(
 def _time_to_cross(
     law: Predictor, state: PredictorState, reference: Reference, sign: float, target: float
 ) -> float:
-    step, goal = FAR / STEPS, sign * target
-    here = sign * expected_strain(law, state, reference, 0.0)
+    # Looked up whether it is needed or not: behind a condition numba counts the references to its
+    # arrays each time, which takes three times as long as all the rest.
+    course = course_of(law, state, reference)
+    step, goal, then = FAR / STEPS, sign * target, course.reference
+    here = sign * weighed(course, then, 0.0)
     for k in range(STEPS):
-        there = sign * expected_strain(law, state, reference, (k + 1) * step)
+        low, high = k * step, (k + 1) * step
+        then = strain_reference(reference, course.time + high)
+        there = sign * weighed(course, then, high)
         rate = (there - here) / step
         if there >= goal and rate > law.minimum_strain_rate:
             if here >= goal:
-                return (goal - here) / rate if k == 0 else k * step
-            low, high = k * step, (k + 1) * step
+                return (goal - here) / rate if k == 0 else low
             for _ in range(HALVINGS):
                 middle = 0.5 * (low + high)
-                if sign * expected_strain(law, state, reference, middle) >= goal:
+                then = strain_reference(reference, course.time + middle)
+                if sign * weighed(course, then, middle) >= goal:
                     high = middle
                 else:
                     low = middle

@@ -66,9 +66,9 @@ def sinusoid_step(state: Sinusoid, strain: float, dt: float) -> Sinusoid:
 
 
 @compiled
-def sinusoid_ahead(state: Sinusoid, ahead: float) -> float:
-    """Return how much the sinusoid will have risen ``ahead`` s from now."""
-    w = state.frequency
-    angle = w * ahead
+def sinusoid_ahead(velocity: float, acceleration: float, frequency: float, ahead: float) -> float:
+    """Return how much a sinusoid will have risen ``ahead`` s from now."""
+    angle = frequency * ahead
     half = math.sin(0.5 * angle)
-    return state.velocity * math.sin(angle) / w + state.acceleration * 2.0 * half * half / (w * w)
+    bend = 2.0 * acceleration * half * half / (frequency * frequency)
+    return velocity * math.sin(angle) / frequency + bend

@@ -19,6 +19,7 @@ from fam_bundle_control.predictors import (
     SINUSOID,
     STEPS,
     Predictor,
+    course_of,
     expected_strain,
     modelled,
     predictor,
@@ -83,6 +84,8 @@ def turning(velocity, acceleration, frequency, position=0.05):
         strain=position,
         strain_rate=velocity,
         position=position,
+        velocity=velocity,
+        acceleration=acceleration,
         sinusoid=known,
         weight=1.0,
         started=True,
@@ -114,15 +117,17 @@ def test_constant_acceleration_is_exact_on_a_parabola():
     law, now = law_of(CONSTANT_ACCELERATION), time[-1]
     for ahead in (0.0, 0.1, HORIZON, REACH):
         then = 0.02 + 0.01 * (now + ahead) - 5e-4 * (now + ahead) ** 2
-        assert modelled(law, state, STILL, ahead) == pytest.approx(then, abs=1e-9)
-    assert expected[-1] == pytest.approx(modelled(law, state, STILL, HORIZON), abs=1e-6)
+        assert modelled(course_of(law, state, STILL), 0.0, ahead) == pytest.approx(then, abs=1e-9)
+    assert expected[-1] == pytest.approx(
+        modelled(course_of(law, state, STILL), 0.0, HORIZON), abs=1e-6
+    )
 
 
 def test_a_parabola_goes_on_as_a_line_beyond_its_reach():
     state = predictor_start()._replace(position=0.05, velocity=0.02, acceleration=-0.3)
     law = law_of(CONSTANT_ACCELERATION)
     ahead = np.array([0.0, REACH, REACH + 0.5, REACH + 1.0])
-    near, reach, far, farther = (modelled(law, state, STILL, t) for t in ahead)
+    near, reach, far, farther = (modelled(course_of(law, state, STILL), 0.0, t) for t in ahead)
     assert near == 0.05
     assert reach == pytest.approx(0.05 + 0.02 * REACH - 0.15 * REACH**2)
     assert far - reach == pytest.approx((0.02 - 0.3 * REACH) * 0.5)
