@@ -26,12 +26,12 @@ CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'l
 
 
 def flat(values):
-    """Yield all numbers in nested tuples and arrays."""
+    """Yield all numbers in nested tuples; what stands in arrays shows in the ticks after it."""
     for value in values:
         if isinstance(value, tuple):
             yield from flat(value)
-        else:
-            yield from np.ravel(value)
+        elif not isinstance(value, np.ndarray):
+            yield value
 
 
 def evaluate():
@@ -42,10 +42,13 @@ def evaluate():
     axis = np.linspace(0.0, 7e5, 6)
     table = LagTable(axis, axis, random.random((2, 6, 6)), 1e5 * random.random((2, 6, 6)))
     found = {}
-    for scheme, allocation in zip(('baseline', 'lag_pressure', 'lag'), ALLOCATIONS, strict=True):
+    schemes = ('baseline', 'lag_pressure', 'lag')
+    predictors = ('constant_rate', 'sinusoid', 'constant_acceleration')
+    for scheme, allocation, expected in zip(schemes, ALLOCATIONS, predictors, strict=True):
+        chosen = dataclasses.replace(configuration.recruitment, scheme=scheme, predictor=expected)
         changed = dataclasses.replace(
             configuration,
-            recruitment=dataclasses.replace(configuration.recruitment, scheme=scheme),
+            recruitment=chosen,
             allocation=AllocationParameters(policy=allocation),
         )
         policy, outer = recruitment(changed), strain_loop(changed)
