@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import rclpy
 from action_msgs.msg import GoalStatus
@@ -21,12 +22,14 @@ from rclpy.node import Node
 
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_bringup.graph import own_domain
+from fam_bundle_bringup.replay import tracked_laws
+from fam_bundle_bringup.replay_controllers import Run, Samples, Stamp, steps_of, strain_answers
 from fam_bundle_control.strain_controller_node import StrainController
 from fam_bundle_model.parameters import Configuration, load_configuration, write_yaml
 from fam_bundle_model.reference import reference_law, strain_reference
 from fam_bundle_msgs.action import TrackStrain
 from fam_bundle_msgs.msg import BundleState, PressureReference, Reference, StrainReference
-from fam_bundle_node.qos import LATCHED, LOOP_PUBLISHER, LOOP_SUBSCRIPTION, NEWEST
+from fam_bundle_node.qos import CHANGES, LOOP_PUBLISHER, LOOP_SUBSCRIPTION, NEWEST
 from fam_bundle_node.reference_message import from_message, to_message
 from fam_bundle_node.run import make_executor
 
@@ -41,6 +44,8 @@ class Bundle(Node):
     def __init__(self) -> None:
         super().__init__('bundle')
         self.references: list[float] = []
+        self.pressures: list[float] = []
+        self.strains: list[float] = []
         self.laws: list[Reference] = []
         self.until = 0
         self.out = self.create_publisher(BundleState, 'bundle_state', LOOP_PUBLISHER)
@@ -48,16 +53,18 @@ class Bundle(Node):
         self.create_subscription(
             PressureReference, 'pressure_reference', self.answered, LOOP_SUBSCRIPTION
         )
-        self.create_subscription(Reference, 'reference', self.laws.append, LATCHED)
+        self.create_subscription(Reference, 'reference', self.laws.append, CHANGES)
         self.client = ActionClient(self, TrackStrain, 'track_strain')
 
     def begin(self) -> None:
         """Begin a new run."""
-        self.references.clear()
+        for values in (self.references, self.pressures, self.strains):
+            values.clear()
         self.publish(0)
 
     def publish(self, tick: int) -> None:
         strain = self.references[-1] if self.references else 0.0
+        self.strains.append(strain)
         message = BundleState(tick=tick, strain=strain, source_pressure=6.8e5)
         nanoseconds = tick * 1_000_000
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
@@ -67,6 +74,7 @@ class Bundle(Node):
     def answered(self, answer: PressureReference) -> None:
         assert answer.tick == len(self.references)
         self.references.append(answer.strain_reference)
+        self.pressures.append(answer.pressure)
         if len(self.references) < self.until:
             self.publish(len(self.references))
 
@@ -144,7 +152,9 @@ def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
         try:
             executor.add_node(controller)
             executor.add_node(bundle)
-            yield Rig(executor, controller, bundle)
+            made = Rig(executor, controller, bundle)
+            made.spin(lambda: len(bundle.laws) == 1)
+            yield made
         finally:
             controller.close()
             executor.shutdown()
@@ -359,3 +369,47 @@ def test_every_reference_of_a_run_follows_from_the_latched_laws(rig: Rig) -> Non
         time = time_of(tick)
         message = [m for stamp, m in laws if stamp < time or m is laws[0][1]][-1]
         assert strain_reference(from_message(message), time) == reference
+
+
+@pytest.mark.parametrize('flat', [True, False], ids=['columns', 'objects'])
+def test_a_replay_tracks_what_was_tracked(rig: Rig, flat: bool) -> None:
+    """A bag's table has a column for each element of arrays, if all messages are of one size."""
+    rig.run(0.3)
+    goal = rig.send(kind='sine', amplitude=0.03, frequency=1.0, **SLOW)
+    rig.run(0.4)
+    rig.spin(goal.cancel_goal_async().done)
+    rig.run(0.4)
+    rig.spin(lambda: len(rig.bundle.laws) == 3)
+    bundle, ticks = rig.bundle, len(rig.bundle.references)
+    messages = bundle.laws[1:2] if flat else bundle.laws
+    until = ticks if not flat else 700
+    table = pd.DataFrame([as_columns(m) if flat else as_object(m) for m in messages])
+    laws, notes = tracked_laws(table, 0, configured())
+    assert notes == []
+    if flat:
+        laws.insert(0, (0, reference_law(configured().reference)))
+    stamps = [Stamp(*divmod(tick * 1_000_000, 10**9)) for tick in range(until)]
+    none, some = [0.0] * until, [6.8e5] * until
+    pressures = np.tile([1e5, 0.0], (until, 1))
+    samples = Samples(
+        list(range(until)), [], stamps, [False] * until, bundle.strains, none, some, pressures
+    )
+    steps = steps_of(samples, samples.tick, set(samples.tick), configured())
+    run = Run(samples, {}, False, laws)
+    found = strain_answers(configured(), run, steps, lambda done: None)
+    assert found['strain_reference'].tolist() == bundle.references[:until]
+    assert found['pressure'].tolist() == bundle.pressures[:until]
+
+
+def as_object(message: Reference) -> dict[str, Any]:
+    names = message.get_fields_and_field_types()
+    return {'published': 1, **{name: getattr(message, name) for name in names}}
+
+
+def as_columns(message: Reference) -> dict[str, Any]:
+    row = as_object(message)
+    stamp = row.pop('header').stamp
+    row |= {'header.stamp.sec': stamp.sec, 'header.stamp.nanosec': stamp.nanosec}
+    for name in ('sines', 'breaks', 'coefficients'):
+        row |= {f'{name}[{k}]': value for k, value in enumerate(row.pop(name))}
+    return row

@@ -8,8 +8,9 @@ And recorded commands into the plant: how good is the model?
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from fam_bundle_bringup.replay_controllers import (
     STATE,
     Comparison,
     Run,
+    Stamp,
     compare_tables,
     replay_controllers,
     samples_of,
@@ -49,13 +51,15 @@ from fam_bundle_io.bag import (
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_model.lag_table import LagTable, cached_lag_table, lag_table_hash
 from fam_bundle_model.parameters import Configuration, load_configuration
+from fam_bundle_model.reference import Reference, reference_law
 from fam_bundle_model.schema import ConfigurationError
+from fam_bundle_node.stamps import nanoseconds
 
 if TYPE_CHECKING:
     import pandas as pd
 
 FILES = ('replay.json', 'replay.png', 'replay.pdf')
-SAMPLES, LAG_TABLE = 'bundle_state', 'lag_table'
+SAMPLES, LAG_TABLE, LAW = 'bundle_state', 'lag_table', 'reference'
 STAMP = ('header.stamp.sec', 'header.stamp.nanosec')
 # Fields without which nothing can be replayed; what else is recorded is only compared.
 NEEDED = {
@@ -92,7 +96,9 @@ def run_replay(bag: Path, config: Path | None, out: Path | None, namespace: str 
     parameters or none, or an ``out`` that cannot be written.
     """
     space = f'/{namespace.strip("/")}'.rstrip('/')
-    found = read_bag(bag, lambda name: name.rpartition('/')[2] in (SAMPLES, LAG_TABLE, *ANSWERS))
+    found = read_bag(
+        bag, lambda name: name.rpartition('/')[2] in (SAMPLES, LAG_TABLE, LAW, *ANSWERS)
+    )
     chosen = choose(found, bag, config)
     tables, notes = tables_of(found, space)
     check_units(chosen, tables[SAMPLES])
@@ -195,8 +201,9 @@ def replay_of(
     """Return what controllers and plant do with the recorded run."""
     configuration, table = chosen.configuration, tables[SAMPLES]
     answers = {topic: tables[topic] for topic in ANSWERS if topic in tables}
-    run = Run(samples_of(table), answers, configuration.run.pace == 'realtime')
-    notes = []
+    begun = int(table['published'].iloc[0])
+    laws, notes = tracked_laws(bag.tables.get(f'{space}/{LAW}'), begun, configuration)
+    run = Run(samples_of(table), answers, configuration.run.pace == 'realtime', laws)
     for topic, found in answers.items():
         lacking = len(table.index.difference(found.index))
         if lacking and not run.realtime:
@@ -216,6 +223,51 @@ def replay_of(
     except BagError as error:
         notes.append(str(error))
     return Replay(chosen, run, comparisons, simulated, notes)
+
+
+def tracked_laws(
+    table: 'pd.DataFrame | None', begun: int, configuration: Configuration
+) -> tuple[list[tuple[int, Reference]], list[str]]:
+    """Return the trajectories of a run, each with the time (ns) after which it holds, and notes.
+
+    The configured one is made of the parameters; live values, goals and the way back from them
+    are taken from ``table``, the messages of the topic ``reference``. ``begun`` is when the run's
+    first sample was published.
+    """
+    from fam_bundle_control.trajectory import GOAL, RETURN
+    from fam_bundle_node.reference_message import from_message
+
+    configured = reference_law(configuration.reference)
+    if table is None or not {'kind', 'published', 'start'} <= set(table):
+        return [(0, configured)], []
+    laws = []
+    first = max(int((table['published'] < begun).sum()) - 1, 0)
+    try:
+        for message in messages_in(table.iloc[first:]):
+            stamp = nanoseconds(message.header.stamp)
+            given = message.kind in ('topic', GOAL, RETURN)
+            laws.append((stamp, from_message(message) if given else configured))
+    except (ValueError, AttributeError) as error:
+        return [(0, configured)], [f'{LAW}: damaged ({error}); only the configured one is tracked']
+    return laws or [(0, configured)], []
+
+
+def messages_in(table: 'pd.DataFrame') -> Iterator[Any]:
+    """Give the messages in a table, whether or not their arrays are columns of their own."""
+    for row in table.to_dict('records'):
+        message: dict[str, Any] = {}
+        for name, value in row.items():
+            field, array, _ = str(name).partition('[')
+            if array:
+                message.setdefault(field, []).append(value)
+            else:
+                message[field] = value
+        for name in ('sines', 'breaks', 'coefficients'):
+            message.setdefault(name, [])
+        if 'header' not in message:
+            stamp = Stamp(message['header.stamp.sec'], message['header.stamp.nanosec'])
+            message['header'] = SimpleNamespace(stamp=stamp)
+        yield SimpleNamespace(**message)
 
 
 def choose_lag_table(

@@ -29,7 +29,7 @@ from fam_bundle_model.compile import direct
 from fam_bundle_model.hydraulics import TO_TANK
 from fam_bundle_model.lag_table import LagTable
 from fam_bundle_model.parameters import Configuration, seconds
-from fam_bundle_model.reference import reference_law, strain_reference
+from fam_bundle_model.reference import Reference, reference_law, strain_reference
 from fam_bundle_node.stamps import StampClock, begins_anew, nanoseconds
 from fam_bundle_node.ticks import TickError
 
@@ -87,11 +87,16 @@ class Samples(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One run: its samples, the tables of what answered them by topic and tick, and its pace."""
+    """One run: its samples, the tables of what answered them by topic and tick, and its pace.
+
+    ``laws`` are the trajectories that were tracked, each with the time of the run (ns) after which
+    it holds.
+    """
 
     samples: Samples
     answers: 'Mapping[str, pd.DataFrame]'
     realtime: bool
+    laws: list[tuple[int, Reference]]
 
 
 def samples_of(table: 'pd.DataFrame') -> Samples:
@@ -185,17 +190,21 @@ def _taken(run: Run, topic: str) -> list[int]:
 
 
 def strain_answers(
-    configuration: Configuration, samples: Samples, steps: Steps, progress: Progress
+    configuration: Configuration, run: Run, steps: Steps, progress: Progress
 ) -> Columns:
     """Return what the strain controller answers: its message's fields, one entry for each step."""
     law, state = strain_loop(configuration), strain_loop_start()
-    units, trajectory = motor_units(configuration), reference_law(configuration.reference)
+    samples, units = run.samples, motor_units(configuration)
+    (_, trajectory), *laws = run.laws
+    laws.reverse()
     measured = (0.0, 0.0, 0.0, np.zeros(len(units)), 1.0)
     step = direct(strain_loop_step, law, units, state, *measured)
     rows = []
     for row, dt, anew, _ in zip(*steps, strict=True):
-        time = seconds(nanoseconds(samples.stamp[row]))
-        reference = strain_reference(trajectory, time)
+        now = nanoseconds(samples.stamp[row])
+        while laws and (laws[-1][0] < now or laws[-1][0] == 0):
+            _, trajectory = laws.pop()
+        reference = strain_reference(trajectory, seconds(now))
         state, output = step(
             law,
             units,
@@ -409,7 +418,7 @@ def replay_controllers(
                 progress(before + steps_done)
 
         if topic == REFERENCE:
-            answers = strain_answers(configuration, samples, steps, report)
+            answers = strain_answers(configuration, run, steps, report)
         elif topic == STATE:
             answers = supervisor_answers(configuration, table, samples, steps, report)
         else:

@@ -22,7 +22,7 @@ from fam_bundle_msgs.action import TrackStrain
 from fam_bundle_msgs.msg import BundleState, PressureReference, StrainReference
 from fam_bundle_msgs.msg import Reference as ReferenceMessage
 from fam_bundle_node.loop_node import Controller
-from fam_bundle_node.qos import LATCHED, NEWEST
+from fam_bundle_node.qos import CHANGES, NEWEST
 from fam_bundle_node.reference_message import to_message
 from fam_bundle_node.run import run_node
 from fam_bundle_node.stamps import nanoseconds
@@ -64,7 +64,7 @@ class StrainController(Controller):
         model = (self.law, self.units, self.state_of_law)
         measured = (0.0, 0.0, 0.0, np.zeros(len(self.units)), 1.0)
         self.step = direct(strain_loop_step, *model, *measured)
-        self.latched = self.create_publisher(ReferenceMessage, 'reference', LATCHED)
+        self.latched = self.create_publisher(ReferenceMessage, 'reference', CHANGES)
         self.announce()
         self.warned_at = -WARNING_PERIOD
         if self.configuration.reference.kind == 'topic':

@@ -28,5 +28,7 @@ REALTIME_SUBSCRIPTION = _reliable(100, DurabilityPolicy.TRANSIENT_LOCAL)
 RECORDER_SUBSCRIPTION = _reliable(5 * WRITER_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
 REPORTS = _reliable(10, DurabilityPolicy.VOLATILE)
 LATCHED = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
+# Latched too, with room for a recorder that is behind: changes can come one upon the other.
+CHANGES = _reliable(100, DurabilityPolicy.TRANSIENT_LOCAL)
 # From outside, by whatever tool: transient local would refuse what most of them offer.
 NEWEST = _reliable(1, DurabilityPolicy.VOLATILE)
