@@ -24,6 +24,7 @@ MARKERS = ('o', 's', 'D', '^', 'v', 'P', 'X', '*')
 RIVAL_COLOUR = '#555555'
 MISSING = {'facecolor': '#f2f2f2', 'edgecolor': '#bbbbbb', 'hatch': '////', 'linewidth': 0.0}
 ANNOTATED = 11  # cells side by side that leave room for their values
+LEVEL = 6  # characters below a panel that need no slope
 ACROSS = 2  # heat maps side by side
 CERTAIN = 1.96  # standard deviations: 95 % of rank correlations by chance are within
 
@@ -195,6 +196,10 @@ def heat_map_figure(
         last.tick_params(labelbottom=True)
     for axes in panels[:, 0]:
         axes.set_ylabel(axis_words(y))
+    if max(len(_label(text)) for text in ticks[x]) > LEVEL:
+        for axes in panels.flat:  # panels share their ticks: the last one drawn makes them anew
+            for label in axes.get_xticklabels():
+                label.set(rotation=30.0, horizontalalignment='right', rotation_mode='anchor')
     if image is not None:
         bar = figure.colorbar(image, ax=panels, pad=0.01, aspect=12 * down)
         if quantity.is_ratio:
@@ -275,10 +280,6 @@ def _draw_ticks(axes: Axes, x: list[Any], y: list[Any]) -> None:
     for axis, labels in ((axes.xaxis, x), (axes.yaxis, y)):
         step = -(-len(labels) // 14)
         axis.set_ticks(range(0, len(labels), step), [_label(text) for text in labels[::step]])
-    if max(len(_label(text)) for text in x) > 6:
-        axes.tick_params(axis='x', labelrotation=30)
-        for label in axes.get_xticklabels():
-            label.set_horizontalalignment('right')
 
 
 def _label(value: Any) -> str:
