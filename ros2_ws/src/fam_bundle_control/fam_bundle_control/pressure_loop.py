@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fam_bundle_control.allocation import allocate
+from fam_bundle_control.allocation import BATCH, allocate
 from fam_bundle_model.bundle import MotorUnit
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.parameters import ALLOCATIONS, Configuration
@@ -55,6 +55,7 @@ def pressure_loop_step(
     vented: reference zero and no integral share, so that a unit is recruited without a bump.
     Pressures in Pa, ``dt`` in s.
     """
+    recruited = min(recruited, len(units))  # a message may say anything
     allocate(
         law.allocation,
         units,
@@ -72,5 +73,9 @@ def pressure_loop_step(
             integral[i] = 0.0
         share, asked = pressure_pi(law.gains[i], integral[i], references[i], mu_pressure[i], dt)
         integral[i] = share
+        # A vented unit below the tank's pressure is filled from the tank, not from the source; the
+        # paper's allocation is left as it was published.
+        if i >= recruited and law.allocation != BATCH:
+            asked = -abs(asked)
         spool[i] = clamp(asked, -1.0, 1.0)
         saturated[i] = spool[i] != asked

@@ -37,6 +37,7 @@ from fam_bundle_model.parameters import ALLOCATIONS, Configuration
 from fam_bundle_model.reference import Reference
 
 TAUT_SHARE = 0.05  # of the measured force; less is not told from noise
+SATURATED = 0.97  # of the source pressure: a unit there has no more to give
 
 
 class Recruitment(NamedTuple):
@@ -156,6 +157,17 @@ def taut_units(
 
 
 @compiled
+def saturated(
+    recruited: int, mu_pressure: npt.NDArray[np.float64], source_pressure: float
+) -> bool:
+    """Return whether every recruited unit is at the source pressure already."""
+    for i in range(recruited):
+        if mu_pressure[i] < SATURATED * source_pressure:
+            return False
+    return True
+
+
+@compiled
 def attainable_pressure(
     law: Recruitment,
     units: tuple[MotorUnit, ...],
@@ -229,6 +241,9 @@ def recruitment_step(
         # that is over before the unit is taut needs none.
         if lag.lag < math.inf:
             lasts = stays_above(law.predictor, expected, reference, limit, lag.lag)
+    # Where the load does not move, no prediction says that the units are at their end.
+    if recruited < len(units) and saturated(recruited, mu_pressure, source_pressure):
+        saturation, lasts = 0.0, lag.lag < math.inf
     release = lag
     if recruited > 1 and may_fall(law.predictor, expected):
         newest_deslack = fam.deslack_pressure(units[newest].fam, strain)

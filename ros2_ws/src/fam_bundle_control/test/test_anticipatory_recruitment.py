@@ -205,3 +205,14 @@ def test_strain_rate_and_force_filters_are_first_order(units, law, constant_tabl
     share = DT / (0.05 + DT)
     expected = lfilter([share], [1.0, share - 1.0], force - force[0]) + force[0]
     assert loads == pytest.approx(expected, rel=1e-12)
+
+
+def test_units_that_have_no_more_to_give_get_help_even_if_nothing_moves(
+    supervise, law, constant_table
+):
+    """A load too heavy for the first unit: no strain rate will ever say so."""
+    supervisor = supervise(law('lag'), constant_table(0.2))
+    assert supervisor.step(400, strain=0.0, pressures=(6e5, 0.0)).recruited == 1
+    assert supervisor.step(strain=0.0, pressures=(6.4e5, 0.0)).recruited == 2
+    hopeless = supervise(law('lag'), constant_table(math.inf))
+    assert hopeless.step(400, strain=0.0, pressures=(6.4e5, 0.0)).recruited == 1

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fam_bundle_control.allocation import BATCH, is_compensated
+from fam_bundle_control.allocation import BATCH, FORCE, is_compensated
 from fam_bundle_control.pressure_loop import PressureLoop, pressure_loop_step
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.parameters import load_configuration
@@ -21,8 +21,8 @@ UNIT = motor_units(load_configuration(CONFIGURATION))[0]
 class Loops:
     """The inner loops of ``count`` units, their pressures given."""
 
-    def __init__(self, count, gains=None):
-        self.law = PressureLoop(gains or (GAINS,) * count, BATCH, 7e5)
+    def __init__(self, count, gains=None, allocation=BATCH):
+        self.law = PressureLoop(gains or (GAINS,) * count, allocation, 7e5)
         self.units = (UNIT,) * count
         self.integral = np.zeros(count)
         self.references, self.spool = np.full((2, count), np.nan)
@@ -127,3 +127,17 @@ def test_each_unit_has_its_own_gains():
             loop.step(1, [pressure])
     assert together.spool.tolist() == [loop.spool[0] for loop in alone]
     assert together.integral.tolist() == [GAINS.integral_limit, 0.1]
+
+
+@pytest.mark.parametrize('pressure', [-2e4, 2e4])
+def test_by_force_a_vented_unit_is_open_to_the_tank_whatever_its_pressure(pressure):
+    """Below the tank's pressure the tank fills it: nothing is taken from the source."""
+    loops = Loops(2, allocation=FORCE).step(1, (4e5, pressure))
+    assert loops.spool[1] == pytest.approx(-GAINS.proportional * 2e4)
+
+
+@pytest.mark.parametrize('allocation', [BATCH, FORCE])
+def test_more_recruited_units_than_there_are_mean_all(allocation):
+    all_of_them = Loops(2, allocation=allocation).step(2, (4e5, 4e5))
+    too_many = Loops(2, allocation=allocation).step(4_000_000_000, (4e5, 4e5))
+    assert too_many.references.tolist() == all_of_them.references.tolist()
