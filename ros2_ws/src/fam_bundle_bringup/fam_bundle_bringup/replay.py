@@ -247,23 +247,27 @@ def tracked_laws(
             stamp = nanoseconds(message.header.stamp)
             given = message.kind in ('topic', GOAL, RETURN)
             laws.append((stamp, from_message(message) if given else configured))
-    except (ValueError, AttributeError) as error:
+    except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
         return [(0, configured)], [f'{LAW}: damaged ({error}); only the configured one is tracked']
     return laws or [(0, configured)], []
 
 
 def messages_in(table: 'pd.DataFrame') -> Iterator[Any]:
-    """Give the messages in a table, whether or not their arrays are columns of their own."""
+    """Give the messages in a table, whether or not their arrays are columns of their own.
+
+    A column for an element that a message does not have holds NaN there.
+    """
     for row in table.to_dict('records'):
         message: dict[str, Any] = {}
+        arrays: dict[str, dict[int, float]] = {'sines': {}, 'breaks': {}, 'coefficients': {}}
         for name, value in row.items():
-            field, array, _ = str(name).partition('[')
-            if array:
-                message.setdefault(field, []).append(value)
-            else:
+            field, _, index = str(name).rstrip(']').partition('[')
+            if not index:
                 message[field] = value
-        for name in ('sines', 'breaks', 'coefficients'):
-            message.setdefault(name, [])
+            elif not math.isnan(value):
+                arrays[field][int(index)] = value
+        for field, elements in arrays.items():
+            message.setdefault(field, [elements[k] for k in sorted(elements)])
         if 'header' not in message:
             stamp = Stamp(message['header.stamp.sec'], message['header.stamp.nanosec'])
             message['header'] = SimpleNamespace(stamp=stamp)

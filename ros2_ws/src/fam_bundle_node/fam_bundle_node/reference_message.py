@@ -26,9 +26,9 @@ def from_message(message: ReferenceMessage) -> Reference:
     if breaks.size == 0:
         raise ValueError('it has no polynomial')
     return Reference(
-        message.start,
-        message.end,
-        message.cycle,
+        float(message.start),
+        float(message.end),
+        float(message.cycle),
         np.array(message.sines, np.float64).reshape(-1, 3),
         breaks,
         np.array(message.coefficients, np.float64).reshape(breaks.size, ORDER),
