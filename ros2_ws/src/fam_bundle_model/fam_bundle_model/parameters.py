@@ -481,6 +481,10 @@ def check_reference(reference: ReferenceParameters) -> None:
         )
     if p.kind == 'samples':
         check_samples(p)
+    if p.kind == 'random' and p.cycles > MOST_SAMPLES // 2:
+        raise ConfigurationError(
+            f'reference.cycles = {p.cycles}: must be <= {MOST_SAMPLES // 2} of random waypoints'
+        )
     if p.kind == 'steps':
         share = 1.0 / (p.frequency * len(p.levels))
         moves = [abs(b - a) for a, b in zip((p.levels[-1], *p.levels[:-1]), p.levels, strict=True)]

@@ -280,6 +280,14 @@ def test_random_waypoints_hang_on_the_seed_alone():
     assert 10 < turns < 40  # two of three random points are extremes
 
 
+def test_too_many_random_waypoints_are_refused():
+    """All of them stand in the latched law."""
+    assert len(reference_law(of('random', cycles=5000)).breaks) == 10_000
+    with pytest.raises(ConfigurationError) as refused:
+        of('random', cycles=5001)
+    assert str(refused.value) == 'reference.cycles = 5001: must be <= 5000 of random waypoints'
+
+
 def test_samples_may_begin_late():
     law = reference_law(of('samples', times=(2.0, 3.0), strains=(0.04, 0.05)))
     assert strain_reference(law, 0.0) == strain_reference(law, 2.0) == 0.04
