@@ -65,16 +65,17 @@ def test_cases_are_sample_by_grid_by_schemes(write: Write) -> None:
     ways, schemes = ('slow', 'fast'), ('baseline', 'lag')
     assert made == list(itertools.product(masses, (0.04, 0.05), ways, schemes))
     for case in found:
-        assert case.configuration is not None and case.situation is not None
-        assert case.configuration.reference.cycles == 3
-        assert case.configuration.load.mass == case.values['load.mass']
-        assert case.configuration.recruitment.scheme == case.scheme
+        assert case.setting is not None and case.situation is not None
+        assert case.setting.believed.reference.cycles == 3
+        assert case.setting.believed.load.mass == case.values['load.mass']
+        assert case.setting.believed.recruitment.scheme == case.scheme
         slow = case.labels['way'] == 'slow'
-        assert case.configuration.reference.frequency == (0.1 if slow else 0.3)
+        assert case.setting.believed.reference.frequency == (0.1 if slow else 0.3)
         # What a label leaves alone is as it was, and stands in the table.
         dwell = case.values['recruitment.minimum_dwell']
-        assert dwell == case.configuration.recruitment.minimum_dwell == (0.3 if slow else 0.1)
-        assert case.situation.recruitment.scheme == found[0].situation.recruitment.scheme
+        assert dwell == case.setting.believed.recruitment.minimum_dwell == (0.3 if slow else 0.1)
+        first = found[0].situation.believed.recruitment
+        assert case.situation.believed.recruitment.scheme == first.scheme
 
 
 def test_schemes_can_be_named_and_change_anything(write: Write) -> None:
@@ -86,9 +87,9 @@ def test_schemes_can_be_named_and_change_anything(write: Write) -> None:
         """)
     )
     assert [case.scheme for case in found] == ['plain', 'early']
-    thresholds = [case.configuration.recruitment.upshift_threshold for case in found]
+    thresholds = [case.setting.believed.recruitment.upshift_threshold for case in found]
     assert thresholds == [0.8, 0.6]
-    assert found[1].situation.recruitment.upshift_threshold == 0.8
+    assert found[1].situation.believed.recruitment.upshift_threshold == 0.8
 
 
 def test_parameter_file_lies_beside_the_study_file(write: Write, tmp_path: Path) -> None:
@@ -96,7 +97,7 @@ def test_parameter_file_lies_beside_the_study_file(write: Write, tmp_path: Path)
     text = source.read_text().replace('mass: 18.8', 'mass: 12.5')
     (tmp_path / 'mine_too.yaml').write_text(text)
     (found,) = cases(write('config: mine_too.yaml'))
-    assert found.configuration.load.mass == 12.5
+    assert found.setting.believed.load.mass == 12.5
 
 
 def test_what_is_impossible_only_together_is_kept_with_its_reason(write: Write) -> None:
@@ -107,7 +108,7 @@ def test_what_is_impossible_only_together_is_kept_with_its_reason(write: Write) 
           recruitment.downshift_threshold: [0.4, 0.6]
         """)
     )
-    impossible = [case for case in found if case.configuration is None]
+    impossible = [case for case in found if case.setting is None]
     assert len(found) == 4
     assert [list(case.values.values())[:2] for case in impossible] == [[0.5, 0.6]]
     assert 'must be < recruitment.upshift_threshold = 0.5' in impossible[0].reason
@@ -120,7 +121,7 @@ def test_example_in_the_readme_is_a_study(tmp_path: Path) -> None:
     (tmp_path / 'mine.yaml').write_text(block)
     found = cases(tmp_path / 'mine.yaml')
     assert len(found) == 100 * 2 * 2 * 2
-    assert all(case.configuration is not None for case in found)
+    assert all(case.setting is not None for case in found)
 
 
 @pytest.mark.parametrize('path', sorted((ROOT / 'studies').glob('*.yaml')), ids=lambda p: p.name)
@@ -211,6 +212,9 @@ REFUSED = [
         'sample: {number: 2, seed: 1, ranges: {recruitment.scheme: [a, b]}}',
         'is no number; name its values under grid',
     ),
+    ('changes: {rig.load.mas: 1}', 'changes: load.mas: no such parameter; did you mean'),
+    ('changes: {rig.load.mass: 0}', 'rig.load.mass = 0 kg: must be > 0'),
+    ('grid: {rig.recruitment.minimum_dwell: [1]}', 'a rig has no such parameter'),
     ('rivals: [me]', 'rivals = me: must be one of best_threshold, always_recruited'),
     ('rivals: [best_threshold, best_threshold]', 'rivals = best_threshold: stands twice'),
     ('heat_map: [load.mass, scheme]', 'heat_map = load.mass: must be one of scheme'),

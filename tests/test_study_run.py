@@ -4,6 +4,7 @@
 import concurrent.futures
 import contextlib
 import csv
+import dataclasses
 import json
 import os
 import signal
@@ -19,15 +20,15 @@ import pytest
 
 from fam_bundle_bringup import hindsight, study_command, study_run
 from fam_bundle_bringup.cli import main
+from fam_bundle_bringup.experiment import measure_tracking
 from fam_bundle_bringup.hindsight import with_threshold
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_bringup.study import Study, cases_of, read_study
-from fam_bundle_bringup.study_case import MEASURED, always_recruited, run_case
+from fam_bundle_bringup.study_case import MEASURED, Setting, run_case
 from fam_bundle_bringup.study_command import print_summary, run_cases
 from fam_bundle_bringup.study_result import read_result
 from fam_bundle_bringup.study_run import Done, Job, Journal
 from fam_bundle_io.metrics import shift_times
-from fam_bundle_model.parameters import Configuration
 from fam_bundle_model.schema import ConfigurationError
 
 SMALL = """
@@ -88,7 +89,7 @@ def test_rows_are_those_of_direct_runs(small: tuple[Study, Path]) -> None:
     assert columns['scheme'] == [case.scheme for case in cases]
     assert columns['status'] == ['ok'] * 4 + ['unreachable'] * 2
     for k, case in enumerate(cases[:4]):
-        trace = run_offline(case.configuration)
+        trace = run_offline(case.setting.believed)
         error = trace['strain_reference'] - trace['strain']
         assert columns['max_error'][k] == np.abs(error).max()
         assert columns['iae'][k] == pytest.approx(np.abs(error).sum() * 1e-3, rel=1e-12)
@@ -102,7 +103,7 @@ def test_rows_are_those_of_direct_runs(small: tuple[Study, Path]) -> None:
         # What comes in is done, given back and lost, or stored: less than a fifth here.
         spent = columns['output'][k] - columns['returned'][k] + columns['throttling_loss'][k]
         assert spent == pytest.approx(given, rel=0.2)
-        assert columns['parameters_hash'][k] == case.configuration.hash()
+        assert columns['parameters_hash'][k] == case.setting.hash()
 
 
 def test_what_the_rig_cannot_reach_is_kept_with_its_reason(small: tuple[Study, Path]) -> None:
@@ -165,18 +166,45 @@ def test_nothing_that_can_be_run_is_refused(here: Here, tmp_path: Path) -> None:
     assert not (tmp_path / 'out').exists()
 
 
+# ---- A rig that is not what the laws believe in ----
+
+HEAVY = """
+changes: {reference.cycles: 1, reference.frequency: 0.5}
+schemes: [lag]
+grid: {rig.load.mass: [18.8, 20.0]}
+rivals: [always_recruited]
+"""
+
+
+def test_a_row_of_another_rig_is_that_of_the_run_on_it(tmp_path: Path) -> None:
+    found = cases_of(written(tmp_path, HEAVY))
+    columns = run_cases(written(tmp_path, HEAVY), tmp_path / 'out', workers=1).columns
+    assert columns['rig.load.mass'] == [18.8, 20.0]
+    for k, case in enumerate(found):
+        believed, actual = case.setting or (None, None)
+        assert believed is not None and actual is not None
+        assert (believed.load.mass, actual.load.mass) == (18.8, columns['rig.load.mass'][k])
+        trace = run_offline(believed, actual=actual)
+        assert columns['iae'][k] == measure_tracking(believed, trace).iae
+        everyone = dataclasses.replace(
+            believed, recruitment=dataclasses.replace(believed.recruitment, scheme='all')
+        )
+        trace = run_offline(everyone, actual=actual)
+        assert columns['always_recruited.iae'][k] == measure_tracking(everyone, trace).iae
+
+
 # ---- Rivals ----
 
 
-def quick(study_text: str, folder: Path) -> Configuration:
+def quick(study_text: str, folder: Path) -> Setting:
     (case, *_) = cases_of(written(folder, study_text))
-    assert case.configuration is not None
-    return case.configuration
+    assert case.setting is not None
+    return case.setting
 
 
 def test_always_recruited_holds_all_units_at_one_pressure(tmp_path: Path) -> None:
-    configuration = quick('changes: {reference.cycles: 2, reference.frequency: 1.0}', tmp_path)
-    trace = run_offline(always_recruited(configuration))
+    text = 'changes: {reference.cycles: 2, reference.frequency: 1.0}\nschemes: all'
+    trace = run_offline(quick(text, tmp_path).believed)
     assert (trace['recruitment_state'] == 2).all()
     settled = trace['mu_pressure'][1000:]
     assert np.abs(settled[:, 0] - settled[:, 1]).max() < 0.03 * settled.max()
@@ -187,8 +215,9 @@ def test_best_threshold_is_the_best_of_those_that_do_not_chatter(
 ) -> None:
     monkeypatch.setattr(hindsight, 'THRESHOLDS', (0.42, 0.55, 0.7))
     text = 'changes: {reference.cycles: 2, reference.frequency: 0.25}\nschemes: [lag, pressure]\n'
-    configuration = quick(text, tmp_path)
-    found = {t: run_case(with_threshold(configuration, t)) for t in (0.42, 0.55, 0.7)}
+    believed = quick(text, tmp_path).believed
+    tuned = {t: with_threshold(believed, t) for t in (0.42, 0.55, 0.7)}
+    found = {t: run_case(Setting(configuration)) for t, configuration in tuned.items()}
     assert found[0.42]['needless_shifts'] > 0
     steady = {t: row for t, row in found.items() if not row['needless_shifts']}
     best = min(steady, key=lambda t: steady[t]['iae'])
@@ -322,7 +351,7 @@ def test_rows_of_other_sources_or_parameters_are_not_used(
     here.performed.clear()
     # One more value: what was there is there.
     run_cases(written(tmp_path, SMALL.replace('0.09', '0.09, 0.055')), out, workers=1)
-    assert {job.configuration.reference.amplitude for job in here.performed} == {0.055}
+    assert {job.setting.believed.reference.amplitude for job in here.performed} == {0.055}
     here.performed.clear()
     # Any other parameter changes every row.
     run_cases(written(tmp_path, SMALL.replace('cycles: 1', 'cycles: 2')), out, workers=1)

@@ -35,12 +35,14 @@ def with_threshold(configuration: Configuration, threshold: float) -> Configurat
 
 
 def best_threshold(
-    configuration: Configuration, progress: Callable[[int], None] | None = None
+    configuration: Configuration,
+    progress: Callable[[int], None] | None = None,
+    actual: Configuration | None = None,
 ) -> Rival | None:
     """Return the threshold with the least IAE among those that do not chatter, if there is one.
 
-    The runs are offline; one that diverges is no rival. ``progress`` is called with the
-    thresholds tried so far.
+    The runs are offline, ``actual`` as in ``run_offline``; one that diverges is no rival.
+    ``progress`` is called with the thresholds tried so far.
     """
     table = cached_lag_table(configuration)
     steady: dict[float, Tracking] = {}
@@ -48,7 +50,7 @@ def best_threshold(
         if threshold > configuration.recruitment.downshift_threshold:
             tried = with_threshold(configuration, threshold)
             with contextlib.suppress(RunFailed):
-                trace = run_offline(tried, table=table)
+                trace = run_offline(tried, table=table, actual=actual)
                 if not needless_shifts(trace):
                     steady[threshold] = measure_tracking(tried, trace)
         if progress is not None:

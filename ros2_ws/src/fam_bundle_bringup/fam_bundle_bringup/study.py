@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fam_bundle_bringup.experiment import default_configuration
-from fam_bundle_bringup.study_case import RIVALS
+from fam_bundle_bringup.study_case import RIVALS, Setting
 from fam_bundle_model.parameters import (
     GROUPS,
     Configuration,
@@ -22,6 +22,16 @@ Changes = Mapping[str, Any]  # values by 'group.parameter'
 KEYS = ('config', 'changes', 'schemes', 'grid', 'sample', 'rivals', 'heat_map')
 SAMPLE_KEYS = ('number', 'seed', 'ranges')
 SCHEME = 'recruitment.scheme'
+RIG = 'rig.'  # before a parameter: that of the rig alone, which the laws do not know
+NOT_OF_THE_RIG = (  # groups of which the rig has nothing
+    'strain_loop',
+    'pressure_loop',
+    'recruitment',
+    'allocation',
+    'lag_table',
+    'reference',
+    'simulation',
+)
 WITHOUT_EFFECT = ('run', 'process', 'bridge')  # groups that change no offline run
 MOST_CASES = 100_000
 
@@ -70,15 +80,15 @@ class Study(NamedTuple):
 class Case(NamedTuple):
     """One run: its scheme, its labels on named axes, its varied parameters by name.
 
-    ``situation`` is the configuration without what the scheme changes: the rivals run in it.
-    Where no configuration can be made of the values it is None, and ``reason`` says why.
+    ``situation`` is the setting without what the scheme changes: the rivals run in it.
+    Where no setting can be made of the values it is None, and ``reason`` says why.
     """
 
     scheme: str
     labels: dict[str, str]
     values: dict[str, Any]
-    configuration: Configuration | None
-    situation: Configuration | None
+    setting: Setting | None
+    situation: Setting | None
     reason: str
 
 
@@ -174,16 +184,19 @@ def _words(entry: str, content: Any, known: Sequence[str]) -> tuple[str, ...]:
 
 
 def declared(name: Any) -> Declaration:
-    """Return the declaration of the parameter 'group.parameter'.
+    """Return the declaration of the parameter 'group.parameter' or 'rig.group.parameter'.
 
     Raises ConfigurationError where there is none, or where it changes no offline run.
     """
-    group, _, parameter = str(name).partition('.')
+    text = str(name).removeprefix(RIG)
+    group, _, parameter = text.partition('.')
+    if text != str(name) and group in NOT_OF_THE_RIG:
+        raise ConfigurationError(f"{name}: a rig has no such parameter; {text} is the laws'")
     if group in WITHOUT_EFFECT:
         raise ConfigurationError(f'{name}: changes no offline run')
     if group not in GROUPS or parameter not in declarations(GROUPS[group]):
         known = [f'{g}.{p}' for g in GROUPS for p in declarations(GROUPS[g])]
-        raise ConfigurationError(unknown(str(name), known))
+        raise ConfigurationError(unknown(text, known))
     return declarations(GROUPS[group])[parameter]
 
 
@@ -329,28 +342,37 @@ def cases_of(study: Study) -> list[Case]:
             situation = {**study.changes, **point}
             for _, changes in chosen:
                 situation |= changes
-            base, _ = _configuration(study, situation)
+            base, _ = _setting(study, situation)
             for scheme, changes in study.schemes.choices.items():
-                found, reason = _configuration(study, {**situation, **changes})
+                found, reason = _setting(study, {**situation, **changes})
                 values = {name: _value(found, {**situation, **changes}, name) for name in names}
                 here = {name: labels[name] for name in named}
                 cases.append(Case(scheme, here, values, found, base, reason))
     return cases
 
 
-def _configuration(study: Study, changes: Changes) -> tuple[Configuration | None, str]:
-    values = {group: dict(content) for group, content in study.base.items()}
-    for name, value in changes.items():
-        group, _, parameter = name.partition('.')
-        values.setdefault(group, {})[parameter] = value
+def _setting(study: Study, changes: Changes) -> tuple[Setting | None, str]:
+    """Return what the laws believe in and the rig: as believed but for what is its own."""
+    own = {name.removeprefix(RIG): v for name, v in changes.items() if name.startswith(RIG)}
+    shared = {name: value for name, value in changes.items() if not name.startswith(RIG)}
     try:
-        return make_configuration(values), ''
+        believed = _configuration(study, shared)
+        return Setting(believed, _configuration(study, shared | own) if own else None), ''
     except ConfigurationError as error:
         return None, str(error)
 
 
-def _value(configuration: Configuration | None, changes: Changes, name: str) -> Any:
-    if configuration is None:
+def _configuration(study: Study, changes: Changes) -> Configuration:
+    values = {group: dict(content) for group, content in study.base.items()}
+    for name, value in changes.items():
+        group, _, parameter = name.partition('.')
+        values.setdefault(group, {})[parameter] = value
+    return make_configuration(values)
+
+
+def _value(setting: Setting | None, changes: Changes, name: str) -> Any:
+    if setting is None:
         return changes.get(name)
-    group, _, parameter = name.partition('.')
+    configuration = setting.rig() if name.startswith(RIG) else setting.believed
+    group, _, parameter = name.removeprefix(RIG).partition('.')
     return getattr(getattr(configuration, group), parameter)

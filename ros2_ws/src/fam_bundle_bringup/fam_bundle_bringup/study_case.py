@@ -28,6 +28,27 @@ from fam_bundle_model.schema import ConfigurationError
 
 Row = dict[str, Any]
 
+
+class Setting(NamedTuple):
+    """What a run is given: what its laws believe in, and the rig, where that is another."""
+
+    believed: Configuration
+    actual: Configuration | None = None
+
+    def rig(self) -> Configuration:
+        """Return the configuration of the rig that is there."""
+        return self.believed if self.actual is None else self.actual
+
+    def hash(self) -> str:
+        """Return a hash of all that shapes a result."""
+        return ' '.join(c.hash() for c in self if c is not None)
+
+    def check(self) -> None:
+        """Raise ConfigurationError where the rig cannot do what is asked, or is thought not to."""
+        for configuration in filter(None, self):
+            check_feasible(configuration)
+
+
 # What a run is measured by; None where it could not be. The window is that of every metric.
 MEASURED = (
     'iae',
@@ -45,18 +66,18 @@ MEASURED = (
 )
 
 
-def measured(configuration: Configuration, trace: Trace) -> Row:
+def measured(setting: Setting, trace: Trace) -> Row:
     """Return the numbers of a whole run, in SI units.
 
     Tracking and energy are taken over the window of the metrics, the last cycle; shifts over the
     whole run. Raises ValueError where the trace does not reach that far or is not finite.
     """
-    window = Window(*last_cycle(configuration))
+    window = Window(*last_cycle(setting.believed))
     inside = ticks_in(trace, window)
     error = (trace['strain_reference'] - trace['strain'])[inside]
     up, down = shift_times(trace)
     interval = shortest_interval(trace)
-    spent = energy(trace, powers(trace, configuration), window)
+    spent = energy(trace, powers(trace, setting.rig()), window)
     efficiency = spent.efficiency
     return {
         **tracking(trace, *window)._asdict(),
@@ -78,19 +99,20 @@ def not_run(status: str, reason: str) -> Row:
     return {'status': status, 'reason': reason, **dict.fromkeys(MEASURED)}
 
 
-def run_case(configuration: Configuration, objection: Callable[[Trace], str] | None = None) -> Row:
+def run_case(setting: Setting) -> Row:
     """Return the row of one case: ``status``, ``reason`` and what it is measured by.
 
-    ``status`` is ``ok``; ``unreachable`` where the rig cannot do it, which is then not tried, or
-    where there is an ``objection`` to its trace; ``diverged`` where the run ended early.
+    ``status`` is ``ok``; ``unreachable`` where the rig cannot do it, which is then not tried;
+    ``diverged`` where the run ended early.
     """
     try:
-        check_feasible(configuration)
+        setting.check()
     except ConfigurationError as error:
         return not_run('unreachable', str(error))
     try:
-        trace = run_offline(configuration, table=lag_table_of(configuration))
-        return {'status': 'ok', 'reason': '', **measured(configuration, trace)}
+        table = lag_table_of(setting.believed)
+        trace = run_offline(setting.believed, table=table, actual=setting.actual)
+        return {'status': 'ok', 'reason': '', **measured(setting, trace)}
     except (RunFailed, ValueError) as error:
         return not_run('diverged', str(error))
 
@@ -116,7 +138,7 @@ def _lag_table(wanted: _Table) -> LagTable:
 # ---- Rivals ----
 
 
-def run_best_threshold(configuration: Configuration) -> Row:
+def run_best_threshold(setting: Setting) -> Row:
     """Return the row of the best fixed threshold for this very reference, by hindsight.
 
     ``threshold`` is the one with the least IAE among those that do not chatter, ``steady`` how
@@ -124,33 +146,30 @@ def run_best_threshold(configuration: Configuration) -> Row:
     """
     found = None
     try:
-        check_feasible(configuration)
-        found = best_threshold(configuration)
+        setting.check()
+        found = best_threshold(setting.believed, actual=setting.actual)
     except ConfigurationError as error:
         reason = str(error)
     else:
         reason = 'every threshold chatters'
     if found is None:
         return {**not_run('unreachable', reason), 'threshold': None, 'steady': 0}
-    row = run_case(with_threshold(configuration, found.threshold))
+    tuned = with_threshold(setting.believed, found.threshold)
+    row = run_case(setting._replace(believed=tuned))
     return {**row, 'threshold': found.threshold, 'steady': found.steady}
 
 
-def always_recruited(configuration: Configuration) -> Configuration:
-    """Return ``configuration`` with all motor units recruited from the first tick to the last."""
-    recruitment = dataclasses.replace(configuration.recruitment, scheme='all')
-    return dataclasses.replace(configuration, recruitment=recruitment)
-
-
-def run_always_recruited(configuration: Configuration) -> Row:
-    """Return the row of the same bundle with all motor units always recruited."""
-    return run_case(always_recruited(configuration))
+def run_always_recruited(setting: Setting) -> Row:
+    """Return the row of the same bundle with all motor units recruited from the first tick on."""
+    recruitment = dataclasses.replace(setting.believed.recruitment, scheme='all')
+    believed = dataclasses.replace(setting.believed, recruitment=recruitment)
+    return run_case(setting._replace(believed=believed))
 
 
 class Rival(NamedTuple):
     """A rival: what runs it, how many runs that takes, and its numbers beside those of a run."""
 
-    run: Callable[[Configuration], Row]
+    run: Callable[[Setting], Row]
     runs: int
     extra: tuple[str, ...]
 

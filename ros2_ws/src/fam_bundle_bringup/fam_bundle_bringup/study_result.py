@@ -52,7 +52,7 @@ def result_of(
         for name in RATIOS:
             both = zip(own, theirs, strict=True)
             columns[f'{rival}.{name}_ratio'] = [_ratio(a[name], b[name]) for a, b in both]
-    hashes = [case.configuration and case.configuration.hash() for case in cases]
+    hashes = [case.setting and case.setting.hash() for case in cases]
     columns['parameters_hash'] = hashes
     return Result(columns, {**provenance_of(study, made_by), **run})
 

@@ -19,10 +19,9 @@ from typing import NamedTuple, TextIO
 
 from fam_bundle_bringup.experiment import versions
 from fam_bundle_bringup.study import Case
-from fam_bundle_bringup.study_case import RIVALS, Row, lag_table_of, not_run, run_case
+from fam_bundle_bringup.study_case import RIVALS, Row, Setting, lag_table_of, not_run, run_case
 from fam_bundle_model.compile import COMPILED_PACKAGES, source_digest
 from fam_bundle_model.lag_table import PHYSICS
-from fam_bundle_model.parameters import Configuration
 from fam_bundle_model.schema import ConfigurationError
 
 CASE = 'case'
@@ -42,7 +41,7 @@ class Job(NamedTuple):
 
     key: str
     kind: str
-    configuration: Configuration
+    setting: Setting
     runs: int
     origin: str
 
@@ -65,9 +64,9 @@ def origin() -> str:
     return digest.hexdigest()[:16]
 
 
-def key_of(kind: str, configuration: Configuration, made_by: str) -> str:
+def key_of(kind: str, setting: Setting, made_by: str) -> str:
     """Return the key of a row: equal for equal runs by equal sources, and for no others."""
-    text = f'{kind} {configuration.hash()} {made_by}'
+    text = f'{kind} {setting.hash()} {made_by}'
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
@@ -79,9 +78,9 @@ def jobs_of(cases: Iterable[Case], rivals: Iterable[str], made_by: str) -> dict[
         for case in cases
         if case.situation is not None
     ]
-    wanted += [(CASE, c.configuration, 1) for c in cases if c.configuration is not None]
+    wanted += [(CASE, case.setting, 1) for case in cases if case.setting is not None]
     wanted.sort(key=lambda item: -item[2])
-    jobs = [Job(key_of(kind, c, made_by), kind, c, runs, made_by) for kind, c, runs in wanted]
+    jobs = [Job(key_of(kind, s, made_by), kind, s, runs, made_by) for kind, s, runs in wanted]
     return {job.key: job for job in jobs}
 
 
@@ -92,9 +91,9 @@ def runs_of(jobs: Mapping[str, Job]) -> int:
 
 def row_of(case: Case, rows: Mapping[str, Row], made_by: str) -> Row:
     """Return the row of ``case``."""
-    if case.configuration is None:
+    if case.setting is None:
         return not_run('impossible', case.reason)
-    return rows[key_of(CASE, case.configuration, made_by)]
+    return rows[key_of(CASE, case.setting, made_by)]
 
 
 def rival_of(case: Case, rival: str, rows: Mapping[str, Row], made_by: str) -> Row:
@@ -112,13 +111,13 @@ def perform(job: Job) -> Done:
     check_origin(job.origin)
     begin = time.process_time()
     run = run_case if job.kind == CASE else RIVALS[job.kind].run
-    return Done(run(job.configuration), time.process_time() - begin)
+    return Done(run(job.setting), time.process_time() - begin)
 
 
 def prepare(job: Job) -> Done:
     """Leave the lag table of ``job`` on disk."""
     check_origin(job.origin)
-    lag_table_of(job.configuration)
+    lag_table_of(job.setting.believed)
     return Done({}, 0.0)
 
 
@@ -257,8 +256,8 @@ def run_jobs(
     so that no two workers do the same. Raises StudyStopped where a worker dies.
     """
     left = {key: job for key, job in jobs.items() if key not in journal.rows}
-    first = {len(job.configuration.fam.count): job for job in left.values()}
-    tables = {job.configuration.hash(*PHYSICS, 'lag_table'): job for job in left.values()}
+    first = {len(job.setting.believed.fam.count): job for job in left.values()}
+    tables = {job.setting.believed.hash(*PHYSICS, 'lag_table'): job for job in left.values()}
 
     runs = runs_of(jobs) - runs_of(left)
     progress(runs)
