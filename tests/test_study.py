@@ -293,3 +293,10 @@ def test_help_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
     text = capsys.readouterr().out
     for word in ('FILE', '--out', '--workers', '--dask', '--csv', '--figures-only'):
         assert word in text
+
+
+@pytest.mark.parametrize('path', sorted((ROOT / 'studies').glob('*.yaml')), ids=lambda path: path.stem)
+def test_every_study_that_is_shipped_can_be_run(path: Path) -> None:
+    found = cases_of(read_study(path))
+    assert found
+    assert not [case.reason for case in found if case.setting is None]
