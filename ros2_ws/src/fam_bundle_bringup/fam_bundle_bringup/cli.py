@@ -323,11 +323,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if (options.out / 'bag').exists():
                 raise ConfigurationError(f'--record: {options.out}/bag exists: name another --out')
         config = options.config or default_configuration()
-        configuration = checked_configuration(config, changes)
+        offline = options.command == 'demo' or getattr(options, 'pace', None) == 'offline'
+        configuration = checked_configuration(config, changes, offline=offline)
         for doubt in doubts(configuration):
             print(f'warning: {doubt}', file=sys.stderr)
-        if getattr(options, 'pace', None) == 'offline' and configuration.reference.kind == 'topic':
-            raise ConfigurationError('reference.kind = topic: --pace offline has no topics')
         if config.resolve() == (options.out / 'parameters.yaml').resolve():
             raise ConfigurationError(f'--out {options.out}: would overwrite {config}')
         prepare_folder(options.out, results)

@@ -48,19 +48,24 @@ def default_configuration() -> Path:
 
 
 def checked_configuration(
-    path: Path, changes: Mapping[str, Mapping[str, Any]] | None = None
+    path: Path, changes: Mapping[str, Mapping[str, Any]] | None = None, *, offline: bool = False
 ) -> Configuration:
     """Return the configuration in ``path`` with ``changes`` if the rig can do what it asks.
 
     Raises ConfigurationError naming parameter, value and bound.
     """
     configuration = load_configuration(path, changes)
-    check_feasible(configuration)
+    check_feasible(configuration, offline=offline)
     return configuration
 
 
-def check_feasible(configuration: Configuration) -> None:
-    """Raise ConfigurationError, naming parameter, value and bound, unless the rig can run it."""
+def check_feasible(configuration: Configuration, *, offline: bool = True) -> None:
+    """Raise ConfigurationError, naming parameter, value and bound, unless the rig can run it.
+
+    ``offline`` tells that there is no graph, from which a live reference could come.
+    """
+    if offline and configuration.reference.kind == 'topic':
+        raise ConfigurationError('reference.kind = topic: a run offline has no topics')
     check_reachable(configuration, motor_units(configuration))
     check_length(configuration)
 
