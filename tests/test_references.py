@@ -9,14 +9,27 @@ import numpy as np
 import pytest
 
 from fam_bundle_bringup.cli import main
-from fam_bundle_bringup.experiment import default_configuration, last_cycle, measure_tracking
+from fam_bundle_bringup.expectation import expectation
+from fam_bundle_bringup.experiment import (
+    check_feasible,
+    default_configuration,
+    last_cycle,
+    measure_tracking,
+)
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.figures import comparison_figure, prediction_figure, run_figure
 from fam_bundle_io.metrics import Window, ticks_in, whole_cycles
 from fam_bundle_io.trace import Trace, load_trace
 from fam_bundle_model.bundle import check_reachable, motor_units
-from fam_bundle_model.parameters import CYCLIC, KINDS, Configuration, load_configuration
+from fam_bundle_model.parameters import (
+    CYCLIC,
+    KINDS,
+    PREDICTORS,
+    Configuration,
+    load_configuration,
+)
 from fam_bundle_model.reference import reference_law, strain_reference
+from fam_bundle_model.schema import ConfigurationError
 
 CURVE = {'times': [0.0, 1.0, 2.5, 4.0], 'strains': [0.0, 0.02, 0.12, 0.03]}
 Run = Callable[[str], tuple[Configuration, Trace]]
@@ -76,11 +89,35 @@ def test_every_figure_of_a_run_can_be_drawn(kind: str, run: Run) -> None:
     configuration, trace = run(kind)
     for figure in (
         run_figure(trace, kind),
-        prediction_figure(trace, configuration),
+        prediction_figure(trace, configuration, expectation(configuration, trace)),
         comparison_figure({'one': trace, 'two': trace}),
     ):
         figure.draw_without_rendering()
         assert figure.axes
+
+
+@pytest.mark.parametrize('predictor', PREDICTORS)
+def test_the_expected_trajectory_of_a_run_is_that_of_its_predictor(predictor: str) -> None:
+    """What was expected for a tick is what was measured there less the predictor's error."""
+    changes = {
+        'reference': {'kind': 'chirp', 'frequency': 0.5, 'final_frequency': 1.0, 'cycles': 1},
+        'recruitment': {'scheme': 'lag', 'predictor': predictor},
+        'sensors': {'strain_noise': 1e-5},
+    }
+    configuration = load_configuration(default_configuration(), changes)
+    trace, horizon = run_offline(configuration), configuration.recruitment.prediction_horizon
+    expected = expectation(configuration, trace)
+    for tick in (400, 900):
+        then = tick + round(horizon / configuration.simulation.period)
+        wanted = trace['strain'][then] - trace['prediction_error'][then]
+        assert expected(tick, np.array([horizon])) == pytest.approx([wanted], abs=1e-12)
+
+
+def test_a_live_reference_is_refused_where_nothing_runs_that_could_send_it() -> None:
+    configuration = load_configuration(default_configuration(), {'reference': {'kind': 'topic'}})
+    check_feasible(configuration, offline=False)
+    with pytest.raises(ConfigurationError, match='kind = topic: a run offline has no topics'):
+        check_feasible(configuration)
 
 
 # ---- On the command line ----
@@ -131,7 +168,7 @@ def test_a_bad_file_is_refused_and_nothing_is_written(
     ('kind', 'message'),
     [
         ('samples', 'reference.times: 1 samples; must be >= 2 and <= 10000'),
-        ('topic', 'reference.kind = topic: --pace offline has no topics'),
+        ('topic', 'reference.kind = topic: a run offline has no topics'),
         ('none.csv', 'none.csv: cannot be read (No such file or directory)'),
     ],
 )

@@ -6,16 +6,21 @@ import importlib.util
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from fam_bundle_bringup.experiment import Result, run_experiment
+from fam_bundle_bringup.expectation import expectation
+from fam_bundle_bringup.experiment import Result, last_cycle, run_experiment
 from fam_bundle_bringup.hindsight import THRESHOLDS, Rival, best_threshold, with_threshold
 from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.progress import progress_bar
-from fam_bundle_io.metrics import Tracking
+from fam_bundle_io.metrics import Tracking, Window, slice_of
 from fam_bundle_io.shapes import Claim, paper_claims
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import PAPER_SCHEMES, AllocationParameters, Configuration
 from fam_bundle_model.schema import ConfigurationError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PAPER = {
     'baseline': Tracking(0.0454, 0.0223),
@@ -114,18 +119,27 @@ def draw_figures(
         'lag': 'Lag compensation',
         'pressure': f'Pressure compensation, threshold {threshold:.0%}',
         'lag_pressure': 'Lag and pressure compensation',
+        'force': 'Ours: allocation by force',
     }
+    window = Window(*last_cycle(configuration))
+    windows = {name: slice_of(trace, window) for name, trace in traces.items()}
+
+    def run_figure(name: str) -> 'Figure':
+        return figures.run_figure(traces[name], titles[name], windows[name])
+
     drawn = {
         'figure_06_response': figures.response_figure(configuration),
-        'figure_07_prediction': figures.prediction_figure(traces['lag'], configuration),
-        'figure_10_source': figures.source_figure(configuration, traces),
-        'figure_11_baseline': figures.run_figure(traces['baseline'], titles['baseline']),
-        'figure_12_lag': figures.run_figure(traces['lag'], titles['lag']),
-        'figure_13_lag_pressure': figures.run_figure(
-            traces['lag_pressure'], titles['lag_pressure']
+        'figure_07_prediction': figures.prediction_figure(
+            traces['lag'], configuration, expectation(configuration, traces['lag'])
         ),
-        'figure_14_comparison': figures.comparison_figure({name: traces[name] for name in PAPER}),
-        'figure_force': figures.run_figure(traces['force'], 'Ours: allocation by force'),
+        'figure_10_source': figures.source_figure(configuration, traces),
+        'figure_11_baseline': run_figure('baseline'),
+        'figure_12_lag': run_figure('lag'),
+        'figure_13_lag_pressure': run_figure('lag_pressure'),
+        'figure_14_comparison': figures.comparison_figure(
+            {name: traces[name] for name in PAPER}, windows
+        ),
+        'figure_force': run_figure('force'),
         'force_surface': figures.surface_figure(configuration),
         'lag_table': figures.lag_table_figure(cached_lag_table(configuration)),
     }
@@ -164,8 +178,9 @@ def print_table(
         console.print('No fixed threshold tracks this reference without chatter.')
     else:
         console.print(
-            f'The threshold of {rival.threshold:.0%} is the best for this very reference, found by '
-            f'trying {THRESHOLDS[0]:.0%} to {THRESHOLDS[-1]:.0%}; it has to be known in advance.'
+            f'The threshold of {rival.threshold:.0%} is the best for this very reference, found '
+            f'by trying {THRESHOLDS[0]:.0%} to {THRESHOLDS[-1]:.0%}; '
+            'it has to be known in advance.'
         )
     console.print(
         'Ours feeds forward what the model knows, and the model is the plant here: a rig will '

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures of runs: one run (Figures 11-13), several (Figure 14), and a prediction (Figure 7)."""
 
-from collections.abc import Mapping
-from itertools import accumulate
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +32,9 @@ from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration
 
 LEAD = 0.05  # a prediction is shown this share of a cycle before its shift
+POINTS = 100  # of an expected trajectory
+# The strains expected at a tick, for times ahead of it in s.
+Expectation = Callable[[int, Array], Array]
 
 
 def _shifts_within(trace: Trace, window: slice) -> tuple[list[float], list[float]]:
@@ -209,20 +211,16 @@ def _zoom(axes: Axes, curves: list[tuple[Array, Array]], start: float, stop: flo
 
 
 class Prediction(NamedTuple):
-    """One tick's prediction: time (s), strain, strain rate (1/s), lag (s), time to limit (s).
+    """One tick's prediction: its number, time (s), strain, lag (s) and time to the limit (s).
 
     The lag is infinite where the next unit would never be filled.
     """
 
+    tick: int
     time: float
     strain: float
-    rate: float
     lag: float
     time_to_limit: float
-
-    def limit(self) -> float:
-        """Return the modelled strain limit: where the expected strain stands at that time."""
-        return self.strain + self.rate * self.time_to_limit
 
 
 def prediction_before(
@@ -239,26 +237,24 @@ def prediction_before(
     if not applies.any():
         return None
     at = int(np.argmax(applies))
-    # The trace holds no strain rate: the filter of the recruitment law, on the same samples.
-    strain, period = signal(trace, 'strain'), time[1] - time[0]
-    share = period / (configuration.recruitment.strain_rate_time_constant + period)
-    differences = (np.diff(strain[: at + 1]) / period).tolist()
-    *_, rate = accumulate(differences, lambda r, d: r + (d - r) * share, initial=0.0)
     return Prediction(
+        at,
         float(time[at]),
-        float(strain[at]),
-        rate,
+        float(signal(trace, 'strain')[at]),
         float(trace['recruitment_lag'][at]),
         float(signal(trace, name)[at]),
     )
 
 
 @styled
-def prediction_figure(trace: Trace, configuration: Configuration) -> Figure:
+def prediction_figure(
+    trace: Trace, configuration: Configuration, expectation: Expectation
+) -> Figure:
     """Return the prediction before the last upshift and before the last downshift (Figure 7).
 
-    Each panel: strain (%), the expectation E(t) at constant rate from one instant, the modelled
-    strain limit, and the times (s) to saturation or desaturation and of the recruitment lag.
+    Each panel: strain (%), the expectation E(t) from one instant, the modelled strain limit,
+    where E(t) stands then, and the times (s) to saturation or desaturation and of the recruitment
+    lag.
     """
     figure = Figure(figsize=(7.2, 3.7))
     panels = figure.subplots(1, 2)
@@ -274,12 +270,18 @@ def prediction_figure(trace: Trace, configuration: Configuration) -> Figure:
             axes.set_axis_off()
         else:
             axes.set_title(f'before the {word} at {times[-1]:.3f} s', pad=24.0)
-            _draw_prediction(axes, trace, found, times[-1], symbol, colour)
+            _draw_prediction(axes, trace, found, expectation, times[-1], symbol, colour)
     return figure
 
 
 def _draw_prediction(
-    axes: Axes, trace: Trace, found: Prediction, shift: float, symbol: str, colour: str
+    axes: Axes,
+    trace: Trace,
+    found: Prediction,
+    expectation: Expectation,
+    shift: float,
+    symbol: str,
+    colour: str,
 ) -> None:
     reach = found.time + found.time_to_limit
     filled = found.time + found.lag if np.isfinite(found.lag) else found.time
@@ -288,10 +290,11 @@ def _draw_prediction(
     time, strain = signal(trace, 'time'), PERCENT * signal(trace, 'strain')
     window = (time >= start) & (time <= stop)
     axes.plot(time[window], strain[window], label='measured', **MEASURED)
-    ends = np.array([min(found.time, reach), max(filled, reach)])
-    expected = PERCENT * (found.strain + found.rate * (ends - found.time))
-    axes.plot(ends, expected, color='#000000', linestyle='-.', linewidth=1.0, label='$E(t)$')
-    limit = PERCENT * found.limit()
+    ahead = np.linspace(min(found.time, reach), max(filled, reach), POINTS) - found.time
+    expected = PERCENT * expectation(found.tick, np.append(ahead, found.time_to_limit))
+    curve = {'color': '#000000', 'linestyle': '-.', 'linewidth': 1.0, 'label': '$E(t)$'}
+    axes.plot(found.time + ahead, expected[:-1], **curve)
+    limit = float(expected[-1])
     axes.axhline(limit, color='#CC79A7', linewidth=1.3, label='strain limit')
     axes.plot(found.time, PERCENT * found.strain, 'o', color='#000000', markersize=4.5)
     axes.plot(reach, limit, 's', color=colour, markersize=5)

@@ -53,6 +53,12 @@ def ticks_in(trace: Trace, window: Window) -> npt.NDArray[np.bool_]:
     return np.asarray(found, dtype=np.bool_)
 
 
+def slice_of(trace: Trace, window: Window) -> slice:
+    """Return the ticks in ``window``, of which there must be one."""
+    inside = np.flatnonzero(ticks_in(trace, window))
+    return slice(int(inside[0]), int(inside[-1]) + 1)
+
+
 def steps(trace: Trace) -> npt.NDArray[np.float64]:
     """Return the time in s that each tick stands for; the last one as long as most do."""
     step = np.diff(trace['time'])

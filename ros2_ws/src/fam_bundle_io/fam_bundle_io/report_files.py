@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fam_bundle_io.bag_writer import BagError
-from fam_bundle_io.metrics import ticks_in
+from fam_bundle_io.metrics import slice_of
 from fam_bundle_io.report import (
     ReportedRun,
     last_cycle_of,
@@ -129,8 +129,7 @@ def ticks_of(run: ReportedRun) -> slice:
     cycle = last_cycle_of(run)
     if cycle is None:
         return slice(0, len(run.trace['time']))
-    inside = np.flatnonzero(ticks_in(run.trace, cycle))
-    return slice(int(inside[0]), int(inside[-1]) + 1)
+    return slice_of(run.trace, cycle)
 
 
 def title_of(run: ReportedRun) -> str:

@@ -13,6 +13,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from fam_bundle_bringup.expectation import expectation
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.figures import (
     comparison_figure,
@@ -31,7 +32,7 @@ from fam_bundle_io.trace import empty_trace
 from fam_bundle_model import fam
 from fam_bundle_model.bundle import modelled_strain, motor_units
 from fam_bundle_model.lag_table import LagTable, build_lag_table, look_up
-from fam_bundle_model.parameters import load_configuration
+from fam_bundle_model.parameters import PREDICTORS, load_configuration
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 QUICK = {
@@ -184,6 +185,10 @@ def test_a_comparison_without_upshift_says_so_and_shows_the_whole_cycle(syntheti
     assert near.get_xlim() == whole.get_xlim()
 
 
+def predictions_of(trace, configuration):
+    return prediction_figure(trace, configuration, expectation(configuration, trace))
+
+
 def filtered_force(trace, configuration):
     """Return the force as the recruitment law filters it (backward Euler)."""
     period, constant = trace['time'][1], configuration.recruitment.force_time_constant
@@ -193,11 +198,14 @@ def filtered_force(trace, configuration):
     return np.array(out)
 
 
-def test_the_strain_limit_drawn_is_that_of_the_model(runs, configuration, table):
-    trace, units = runs['lag'], motor_units(configuration)
+@pytest.mark.parametrize('predictor', PREDICTORS)
+def test_the_expected_strain_drawn_meets_the_limit_of_the_model(configuration, table, predictor):
+    recruitment = dataclasses.replace(configuration.recruitment, scheme='lag', predictor=predictor)
+    configuration = dataclasses.replace(configuration, recruitment=recruitment)
+    trace, units = run_offline(configuration, table=table), motor_units(configuration)
     load = filtered_force(trace, configuration)
     ups, downs = shift_times(trace)
-    panels = prediction_figure(trace, configuration).axes
+    panels = predictions_of(trace, configuration).axes
     for axes, name, shift in (
         (panels[0], 'time_to_saturation', ups[-1]),
         (panels[1], 'time_to_desaturation', downs[-1]),
@@ -208,25 +216,28 @@ def test_the_strain_limit_drawn_is_that_of_the_model(runs, configuration, table)
         lag = look_up(table, 1, source, fam.deslack_pressure(units[1].fam, strain))
         limit = modelled_strain(units, 1, source - lag.drop, load[at])
         assert lines(axes, 'strain limit').get_ydata()[0] == pytest.approx(100.0 * limit, rel=1e-6)
+        time, drawn = lines(axes, '$E(t)$').get_data()
+        there = np.interp(found.time + found.time_to_limit, time, drawn)
+        assert there == pytest.approx(100.0 * limit, rel=1e-3)
         assert vertical_lines(axes) == pytest.approx([shift])
         assert any(f'{found.lag:.3f} s' in text for text in texts(axes))
         assert lag.lag == pytest.approx(found.lag)
 
 
 def test_a_prediction_figure_without_shifts_says_so(synthetic, configuration):
-    panels = prediction_figure(synthetic(shifts=False), configuration).axes
+    panels = predictions_of(synthetic(shifts=False), configuration).axes
     assert [texts(a) for a in panels] == [['no upshift in this run'], ['no downshift in this run']]
 
 
 def test_a_shift_that_nothing_predicted_is_told_from_no_shift(synthetic, configuration):
-    panels = prediction_figure(synthetic(), configuration).axes
+    panels = predictions_of(synthetic(), configuration).axes
     assert texts(panels[0]) == ['no prediction before the upshift']
 
 
 def test_a_lag_that_never_ends_is_named_and_not_drawn(synthetic, configuration):
     trace = synthetic()
     trace['time_to_saturation'][120:131] = 0.1
-    axes = prediction_figure(trace, configuration).axes[0]
+    axes = predictions_of(trace, configuration).axes[0]
     assert any(text.endswith(': never') for text in texts(axes))
     assert np.isfinite([*axes.get_xlim(), *axes.get_ylim()]).all()
 
