@@ -295,7 +295,9 @@ def test_help_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
         assert word in text
 
 
-@pytest.mark.parametrize('path', sorted((ROOT / 'studies').glob('*.yaml')), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    'path', sorted((ROOT / 'studies').glob('*.yaml')), ids=lambda path: path.stem
+)
 def test_every_study_that_is_shipped_can_be_run(path: Path) -> None:
     found = cases_of(read_study(path))
     assert found

@@ -161,7 +161,7 @@ def saturated(
     recruited: int, mu_pressure: npt.NDArray[np.float64], source_pressure: float
 ) -> bool:
     """Return whether every recruited unit is at the source pressure already."""
-    for i in range(recruited):
+    for i in range(recruited):  # noqa: SIM110  numba has no all()
         if mu_pressure[i] < SATURATED * source_pressure:
             return False
     return True

@@ -110,14 +110,15 @@ def test_the_cache_folder_follows_the_sources(monkeypatch, tmp_path):
     source = package / '__init__.py'
     source.write_text('x = 1\n')
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(compile, 'COMPILED_PACKAGES', ('fam_bundle_example', 'not_there'))
-    first = compile.source_digest()
-    assert compile.source_digest() == first
+    packages = ('fam_bundle_example', 'not_there')
+    first = compile.source_digest(packages)
+    assert compile.source_digest(packages) == first
     source.write_text('x = 2\n')
-    second = compile.source_digest()
+    second = compile.source_digest(packages)
     assert second != first
     (package / 'more.py').write_text('')
-    assert compile.source_digest() not in (first, second)
+    assert compile.source_digest(packages) not in (first, second)
+    assert compile.source_digest() == compile.source_digest(compile.COMPILED_PACKAGES)
 
 
 def test_the_cache_is_the_users(monkeypatch, tmp_path):

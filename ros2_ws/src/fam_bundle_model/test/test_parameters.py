@@ -22,7 +22,8 @@ DIMENSIONLESS = {
     'fam': 'count youngs_modulus_factor mooney_rivlin_share poisson_ratio collapse_moment_factor '
     'end_spring_span end_spring_offset transition_constant',
     'pressure_loop': 'integral_limit',
-    'recruitment': 'scheme upshift_threshold downshift_threshold',
+    'recruitment': 'scheme predictor upshift_threshold downshift_threshold',
+    'allocation': 'policy feedforward',
     'sensors': 'strain_noise strain_resolution seed',
     'simulation': 'substeps initial_strain',
     'lag_table': 'source_points deslack_points minimum_source',
