@@ -2,9 +2,11 @@
 """The strain controller's own reference: goals, live values, and the latched law.
 
 The node runs in this process beside a bundle that is perfect: its strain is the reference of the
-tick before. Times are those of the run.
+tick before. Where trajectories are foreseen the supervisor is there too. Times are those of the
+run.
 """
 
+import contextlib
 import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,18 +25,39 @@ from rclpy.node import Node
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_bringup.graph import own_domain
 from fam_bundle_bringup.replay import tracked_laws
-from fam_bundle_bringup.replay_controllers import Run, Samples, Stamp, steps_of, strain_answers
+from fam_bundle_bringup.replay_controllers import (
+    Run,
+    Samples,
+    Stamp,
+    steps_of,
+    strain_answers,
+    supervisor_answers,
+)
+from fam_bundle_control.announced import NOTICE
+from fam_bundle_control.recruitment import RecruitmentOutput
+from fam_bundle_control.recruitment_supervisor_node import RecruitmentSupervisor
 from fam_bundle_control.strain_controller_node import StrainController
+from fam_bundle_model.bundle import modelled_strain, motor_units
+from fam_bundle_model.lag_table import cached_lag_table, lag_table_hash
 from fam_bundle_model.parameters import Configuration, load_configuration, write_yaml
 from fam_bundle_model.reference import reference_law, strain_reference
 from fam_bundle_msgs.action import TrackStrain
-from fam_bundle_msgs.msg import BundleState, PressureReference, Reference, StrainReference
-from fam_bundle_node.qos import CHANGES, LOOP_PUBLISHER, LOOP_SUBSCRIPTION, NEWEST
+from fam_bundle_msgs.msg import (
+    BundleState,
+    LagTable,
+    PressureReference,
+    RecruitmentState,
+    Reference,
+    StrainReference,
+)
+from fam_bundle_node import lag_table_message
+from fam_bundle_node.qos import CHANGES, LATCHED, LOOP_PUBLISHER, LOOP_SUBSCRIPTION, NEWEST
 from fam_bundle_node.reference_message import from_message, to_message
 from fam_bundle_node.run import make_executor
 
 PERIOD = 1e-3
 PATIENCE = 30.0  # s
+WEIGHT = 180.0  # N, of the load that hangs on the bundle
 SLOW = {'strain_rate': 0.2, 'strain_acceleration': 4.0}
 
 
@@ -47,6 +70,8 @@ class Bundle(Node):
         self.pressures: list[float] = []
         self.strains: list[float] = []
         self.laws: list[Reference] = []
+        self.states: list[tuple[Any, ...]] = []
+        self.supervised = False
         self.until = 0
         self.out = self.create_publisher(BundleState, 'bundle_state', LOOP_PUBLISHER)
         self.live = self.create_publisher(StrainReference, 'strain_reference', NEWEST)
@@ -54,18 +79,23 @@ class Bundle(Node):
             PressureReference, 'pressure_reference', self.answered, LOOP_SUBSCRIPTION
         )
         self.create_subscription(Reference, 'reference', self.laws.append, CHANGES)
+        self.create_subscription(
+            RecruitmentState, 'recruitment_state', self.decided, LOOP_SUBSCRIPTION
+        )
+        self.table = self.create_publisher(LagTable, 'lag_table', LATCHED)
+        self.news = self.create_publisher(Reference, 'reference', CHANGES)
         self.client = ActionClient(self, TrackStrain, 'track_strain')
 
     def begin(self) -> None:
         """Begin a new run."""
-        for values in (self.references, self.pressures, self.strains):
+        for values in (self.references, self.pressures, self.strains, self.states):
             values.clear()
         self.publish(0)
 
     def publish(self, tick: int) -> None:
         strain = self.references[-1] if self.references else 0.0
         self.strains.append(strain)
-        message = BundleState(tick=tick, strain=strain, source_pressure=6.8e5)
+        message = BundleState(tick=tick, strain=strain, source_pressure=6.8e5, force=WEIGHT)
         nanoseconds = tick * 1_000_000
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
         message.mu_pressure = [1e5, 0.0]
@@ -75,15 +105,30 @@ class Bundle(Node):
         assert answer.tick == len(self.references)
         self.references.append(answer.strain_reference)
         self.pressures.append(answer.pressure)
-        if len(self.references) < self.until:
-            self.publish(len(self.references))
+        self.go_on()
+
+    def decided(self, answer: RecruitmentState) -> None:
+        self.states.append(tuple(getattr(answer, name) for name in RecruitmentOutput._fields))
+        self.go_on()
+
+    def go_on(self) -> None:
+        """Publish the next tick when all have answered the last one."""
+        done = len(self.references)
+        if done < self.until and done == (len(self.states) if self.supervised else done):
+            self.publish(done)
+
+    @property
+    def answered_all(self) -> bool:
+        """Whether all of the wanted ticks are answered."""
+        waits = self.states if self.supervised else self.references
+        return min(len(self.references), len(waits)) >= self.until
 
 
 class Rig:
     """The two nodes on one executor."""
 
-    def __init__(self, executor: Executor, controller: StrainController, bundle: Bundle) -> None:
-        self.executor, self.controller, self.bundle = executor, controller, bundle
+    def __init__(self, executor: Executor, nodes: list[Any], bundle: Bundle) -> None:
+        self.executor, self.nodes, self.bundle = executor, nodes, bundle
 
     def spin(self, done: Callable[[], bool]) -> None:
         waits = rclpy.task.Future()
@@ -101,7 +146,7 @@ class Rig:
             bundle.publish(len(bundle.references))
         else:
             bundle.begin()
-        self.spin(lambda: len(bundle.references) >= bundle.until)
+        self.spin(lambda: bundle.answered_all)
 
     def send(self, feedback: Callable[[Any], None] | None = None, **goal: Any) -> Any:
         """Send a goal and return its handle."""
@@ -134,32 +179,49 @@ def time_of(tick: int) -> float:
     return tick * 1_000_000 / 1e9
 
 
-def configured(**reference: Any) -> Configuration:
+def configured(predictor: str = 'preview', **reference: Any) -> Configuration:
     values = {'kind': 'sine', 'frequency': 0.5, 'cycles': 4, **reference}
-    return load_configuration(default_configuration(), {'reference': values})
+    changes = {'reference': values, 'recruitment': {'predictor': predictor}}
+    return load_configuration(default_configuration(), changes)
 
 
 @pytest.fixture
 def rig(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Rig]:
     """Return the rig with a configured reference, and an executor, of the test's choice."""
     reference, kind = getattr(request, 'param', ({}, 'events'))
-    parameter_file = tmp_path / 'parameters.yaml'
-    write_yaml(configured(**reference), parameter_file)
+    with rig_of(configured(**reference), kind, tmp_path) as made:
+        yield made
+
+
+@contextlib.contextmanager
+def rig_of(
+    configuration: Configuration, kind: str, folder: Path, *, supervised: bool = False
+) -> Iterator[Rig]:
+    """Give the nodes of a run, and take them down."""
+    write_yaml(configuration, folder / 'parameters.yaml')
     with own_domain():
-        rclpy.init(args=['--ros-args', '--params-file', str(parameter_file)])
+        rclpy.init(args=['--ros-args', '--params-file', str(folder / 'parameters.yaml')])
         executor = make_executor(kind)
-        controller, bundle = StrainController(), Bundle()
+        bundle = Bundle()
+        nodes = [StrainController(), *([RecruitmentSupervisor()] if supervised else [])]
         try:
-            executor.add_node(controller)
-            executor.add_node(bundle)
-            made = Rig(executor, controller, bundle)
+            for node in (*nodes, bundle):
+                executor.add_node(node)
+            made = Rig(executor, nodes, bundle)
             made.spin(lambda: len(bundle.laws) == 1)
+            if supervised:
+                bundle.supervised = True
+                table = cached_lag_table(configuration)
+                message = lag_table_message.to_message(table, lag_table_hash(configuration))
+                bundle.table.publish(message)
+                made.spin(lambda: bundle.out.get_subscription_count() == len(nodes))
             yield made
         finally:
-            controller.close()
+            for node in nodes:
+                node.close()
             executor.shutdown()
-            bundle.destroy_node()
-            controller.destroy_node()
+            for node in (*nodes, bundle):
+                node.destroy_node()
             rclpy.try_shutdown()
 
 
@@ -380,22 +442,28 @@ def test_a_replay_tracks_what_was_tracked(rig: Rig, flat: bool) -> None:
     rig.spin(goal.cancel_goal_async().done)
     rig.run(0.4)
     rig.spin(lambda: len(rig.bundle.laws) == 3)
-    bundle, ticks = rig.bundle, len(rig.bundle.references)
+    bundle = rig.bundle
     table = pd.DataFrame([as_columns(m) if flat else as_object(m) for m in bundle.laws])
     assert ('coefficients[11]' in table) == flat
     laws, notes = tracked_laws(table, 2, configured())
     assert notes == []
-    stamps = [Stamp(*divmod(tick * 1_000_000, 10**9)) for tick in range(ticks)]
-    none, some = [0.0] * ticks, [6.8e5] * ticks
-    pressures = np.tile([1e5, 0.0], (ticks, 1))
-    samples = Samples(
-        list(range(ticks)), [], stamps, [False] * ticks, bundle.strains, none, some, pressures
-    )
-    steps = steps_of(samples, samples.tick, set(samples.tick), configured())
-    run = Run(samples, {}, False, laws)
+    run = run_of(bundle)._replace(laws=laws)
+    steps = steps_of(run.samples, run.samples.tick, set(run.samples.tick), configured())
     found = strain_answers(configured(), run, steps, lambda done: None)
     assert found['strain_reference'].tolist() == bundle.references
     assert found['pressure'].tolist() == bundle.pressures
+
+
+def run_of(bundle: Bundle) -> Run:
+    """Return what a recorder would have of a run, but for its laws."""
+    ticks = len(bundle.references)
+    stamps = [Stamp(*divmod(tick * 1_000_000, 10**9)) for tick in range(ticks)]
+    force, source = [WEIGHT] * ticks, [6.8e5] * ticks
+    pressures = np.tile([1e5, 0.0], (ticks, 1))
+    samples = Samples(
+        list(range(ticks)), [], stamps, [False] * ticks, bundle.strains, force, source, pressures
+    )
+    return Run(samples, {}, False, [])
 
 
 def as_object(message: Reference) -> dict[str, Any]:
@@ -411,3 +479,101 @@ def as_columns(message: Reference) -> dict[str, Any]:
     for name in ('sines', 'breaks', 'coefficients'):
         row |= {f'{name}[{k}]': value for k, value in enumerate(row.pop(name))}
     return row
+
+
+# ---- The supervisor foresees them ----
+
+
+def column(bundle: Bundle, name: str) -> np.ndarray:
+    return np.array([state[RecruitmentOutput._fields.index(name)] for state in bundle.states])
+
+
+def assert_replay_gives(bundle: Bundle, configuration: Configuration, ticks: int) -> None:
+    """Hold the first ``ticks`` of the supervisor's answers against its law on the record."""
+    table = pd.DataFrame([as_object(message) for message in bundle.laws])
+    laws, notes = tracked_laws(table, 2, configuration)
+    assert notes == []
+    run = run_of(bundle)._replace(laws=laws)
+    steps = steps_of(run.samples, run.samples.tick, set(run.samples.tick), configuration)
+    lags = cached_lag_table(configuration)
+    found = supervisor_answers(configuration, lags, run, steps, lambda done: None)
+    for name, values in found.items():
+        assert values[:ticks].tobytes() == column(bundle, name)[:ticks].tobytes(), name
+
+
+# Held for half a second, then up beyond what one unit holds.
+RISE = {'kind': 'samples', 'times': [0.0, 0.5, 1.2], 'strains': [0.02, 0.02, 0.13], **SLOW}
+
+
+def test_a_goal_is_foreseen_from_a_fixed_time_after_its_news_on(tmp_path: Path) -> None:
+    configuration = configured(amplitude=0.0)
+    with rig_of(configuration, 'events', tmp_path, supervised=True) as rig:
+        rig.run(0.3)
+        assert rig.send(**RISE).accepted
+        rig.run(1.6)
+        bundle = rig.bundle
+    goal, stamp = from_message(bundle.laws[-1]), bundle.laws[-1].header.stamp.nanosec
+    told = stamp // 1_000_000 + NOTICE // 1_000_000 + 1
+    left = column(bundle, 'time_to_saturation')
+    assert np.isinf(left[:told]).all(), 'nothing was to happen'
+    assert np.isfinite(left[told]), 'though what one unit can hold is a second away'
+    # The course alone tells when the strain will be at what one unit can hold.
+    shift = int(np.argmax(column(bundle, 'recruited') == 2))
+    margin = column(bundle, 'source_pressure_drop') + column(bundle, 'pressure_compensation')
+    attainable, unforeseen = 6.8e5 - margin, bundle.references[told]
+    assert 0.0 < unforeseen < 0.003, 'it had begun to move when it was foreseen'
+    for tick in range(told, shift, 50):
+        limit = modelled_strain(motor_units(configuration), 1, attainable[tick], WEIGHT)
+        then = strain_reference(goal, time_of(tick) + left[tick])
+        assert then == pytest.approx(limit, abs=unforeseen)
+    assert shift > told + 100
+    assert left[shift] <= column(bundle, 'recruitment_lag')[shift] + PERIOD
+    # What was expected before the news is due a horizon later.
+    horizon = round(configuration.recruitment.prediction_horizon / PERIOD)
+    error = np.abs(column(bundle, 'prediction_error'))
+    assert error[told : told + horizon].max() > 0.01
+    assert error[told + horizon :].max() < unforeseen
+    assert_replay_gives(bundle, configuration, len(bundle.states))
+
+
+def test_the_constant_rate_does_not_foresee_a_goal(tmp_path: Path) -> None:
+    configuration = configured('constant_rate', amplitude=0.0)
+    with rig_of(configuration, 'events', tmp_path, supervised=True) as rig:
+        rig.run(0.3)
+        rig.send(**RISE)
+        rig.run(1.6)
+        assert np.abs(column(rig.bundle, 'prediction_error')).max() > 0.02
+        assert_replay_gives(rig.bundle, configuration, len(rig.bundle.states))
+
+
+def test_live_values_are_expected_to_go_on_and_a_goal_after_them_is_foreseen(
+    tmp_path: Path,
+) -> None:
+    live = {'kind': 'topic', 'strain_rate': 0.1}
+    configuration = configured(**live)
+    with rig_of(configuration, 'events', tmp_path, supervised=True) as rig:
+        rig.run(0.1)
+        rig.connect_live()
+        rig.bundle.live.publish(StrainReference(strain=0.03))
+        rig.spin(lambda: len(rig.bundle.laws) == 2)
+        rig.run(0.5)
+        before = len(rig.bundle.states)
+        assert rig.send(**RISE).accepted
+        rig.run(0.2)
+        assert_replay_gives(rig.bundle, configured('constant_rate', **live), before)
+        assert np.isinf(column(rig.bundle, 'time_to_saturation')[before])
+        assert np.isfinite(column(rig.bundle, 'time_to_saturation')[-1])
+        assert_replay_gives(rig.bundle, configuration, len(rig.bundle.states))
+
+
+def test_news_that_come_after_their_tick_end_a_run_in_lockstep(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with rig_of(configured(), 'events', tmp_path, supervised=True) as rig:
+        rig.run(0.3)
+        late = to_message(reference_law(configured(kind='ramp').reference), 'goal')
+        late.header.stamp.nanosec = 100_000_000
+        rig.bundle.news.publish(late)
+        rig.spin(rig.nodes[1].done.done)
+        assert rig.nodes[1].done.result() == 1
+    assert 'reference: came 149 ms too late to be foreseen in time' in capfd.readouterr().err

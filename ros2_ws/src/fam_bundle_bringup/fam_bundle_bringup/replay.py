@@ -39,6 +39,8 @@ from fam_bundle_bringup.replay_plant import (
     measured,
     replay_plant,
 )
+from fam_bundle_control.announced import BEGINNING, Announcement
+from fam_bundle_control.trajectory import FROM_OUTSIDE, LIVE
 from fam_bundle_io.bag import (
     LOOP,
     Bag,
@@ -51,7 +53,7 @@ from fam_bundle_io.bag import (
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_model.lag_table import LagTable, cached_lag_table, lag_table_hash
 from fam_bundle_model.parameters import Configuration, load_configuration
-from fam_bundle_model.reference import Reference, reference_law
+from fam_bundle_model.reference import reference_law
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.stamps import nanoseconds
 
@@ -227,29 +229,29 @@ def replay_of(
 
 def tracked_laws(
     table: 'pd.DataFrame | None', begun: int, configuration: Configuration
-) -> tuple[list[tuple[int, Reference]], list[str]]:
-    """Return the trajectories of a run, each with the time (ns) after which it holds, and notes.
+) -> tuple[list[Announcement], list[str]]:
+    """Return the trajectories of a run, that of its beginning first, and notes.
 
     The configured one is made of the parameters; live values, goals and the way back from them
     are taken from ``table``, the messages of the topic ``reference``. ``begun`` is when the run's
     first sample was published.
     """
-    from fam_bundle_control.trajectory import GOAL, RETURN
     from fam_bundle_node.reference_message import from_message
 
-    configured = reference_law(configuration.reference)
+    reference = configuration.reference
+    configured = Announcement(BEGINNING, reference_law(reference), reference.kind == LIVE)
     if table is None or not {'kind', 'published', 'start'} <= set(table):
-        return [(0, configured)], []
-    laws = []
+        return [configured], []
+    laws = [configured]
     first = max(int((table['published'] < begun).sum()) - 1, 0)
     try:
         for message in messages_in(table.iloc[first:]):
-            stamp = nanoseconds(message.header.stamp)
-            given = message.kind in ('topic', GOAL, RETURN)
-            laws.append((stamp, from_message(message) if given else configured))
+            since = nanoseconds(message.header.stamp) or BEGINNING
+            law = from_message(message) if message.kind in FROM_OUTSIDE else configured.law
+            laws.append(Announcement(since, law, message.kind == LIVE))
     except (ValueError, TypeError, AttributeError, KeyError, OverflowError) as error:
-        return [(0, configured)], [f'{LAW}: damaged ({error}); only the configured one is tracked']
-    return laws or [(0, configured)], []
+        return [configured], [f'{LAW}: damaged ({error}); only the configured one is tracked']
+    return laws, []
 
 
 def messages_in(table: 'pd.DataFrame') -> Iterator[Any]:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fam_bundle_control.announced import NOTICE, Announced, Announcement
 from fam_bundle_control.pressure_loop import pressure_loop, pressure_loop_step
 from fam_bundle_control.recruitment import (
     RecruitmentOutput,
@@ -29,7 +30,7 @@ from fam_bundle_model.compile import direct
 from fam_bundle_model.hydraulics import TO_TANK
 from fam_bundle_model.lag_table import LagTable
 from fam_bundle_model.parameters import Configuration, seconds
-from fam_bundle_model.reference import Reference, reference_law, strain_reference
+from fam_bundle_model.reference import strain_reference
 from fam_bundle_node.stamps import StampClock, begins_anew, nanoseconds
 from fam_bundle_node.ticks import TickError
 
@@ -89,14 +90,13 @@ class Samples(NamedTuple):
 class Run(NamedTuple):
     """One run: its samples, the tables of what answered them by topic and tick, and its pace.
 
-    ``laws`` are the trajectories that were tracked, each with the time of the run (ns) after which
-    it holds.
+    ``laws`` are the trajectories that were tracked, that of the beginning first.
     """
 
     samples: Samples
     answers: 'Mapping[str, pd.DataFrame]'
     realtime: bool
-    laws: list[tuple[int, Reference]]
+    laws: list[Announcement]
 
 
 def samples_of(table: 'pd.DataFrame') -> Samples:
@@ -189,22 +189,27 @@ def _taken(run: Run, topic: str) -> list[int]:
 # ---- The three laws ----
 
 
+def announced(laws: list[Announcement], notice: int) -> Announced:
+    """Return the trajectories of a run, each of which counts ``notice`` ns after its time."""
+    found = Announced(laws[0], notice)
+    for law in laws[1:]:
+        found.add(law)
+    return found
+
+
 def strain_answers(
     configuration: Configuration, run: Run, steps: Steps, progress: Progress
 ) -> Columns:
     """Return what the strain controller answers: its message's fields, one entry for each step."""
     law, state = strain_loop(configuration), strain_loop_start()
     samples, units = run.samples, motor_units(configuration)
-    (_, trajectory), *laws = run.laws
-    laws.reverse()
+    tracked = announced(run.laws, notice=0)
     measured = (0.0, 0.0, 0.0, np.zeros(len(units)), 1.0)
     step = direct(strain_loop_step, law, units, state, *measured)
     rows = []
     for row, dt, anew, _ in zip(*steps, strict=True):
         now = nanoseconds(samples.stamp[row])
-        while laws and (laws[-1][0] < now or laws[-1][0] == 0):
-            _, trajectory = laws.pop()
-        reference = strain_reference(trajectory, seconds(now))
+        reference = strain_reference(tracked.at(now).law, seconds(now))
         state, output = step(
             law,
             units,
@@ -224,25 +229,28 @@ def strain_answers(
 def supervisor_answers(
     configuration: Configuration,
     table: LagTable,
-    samples: Samples,
+    run: Run,
     steps: Steps,
     progress: Progress,
 ) -> Columns:
     """Return what the recruitment supervisor answers with the lag table ``table``."""
-    law, units = recruitment(configuration), motor_units(configuration)
-    memory, trajectory = recruitment_start(), reference_law(configuration.reference)
+    laws = [recruitment(configuration, live=live) for live in (False, True)]
+    samples, units, memory = run.samples, motor_units(configuration), recruitment_start()
+    foreseen = announced(run.laws, NOTICE)
     none = np.zeros(len(units))
-    model = (law, units, table, trajectory, recruitment_start())
+    model = (laws[False], units, table, run.laws[0].law, recruitment_start())
     decide = direct(recruitment_step, *model, 0.0, 0.0, 0.0, 0.0, none, 1.0)
     rows = []
     for row, dt, anew, _ in zip(*steps, strict=True):
+        now = nanoseconds(samples.stamp[row])
+        known = foreseen.at(now)
         memory, output = decide(
-            law,
+            laws[known.live],
             units,
             table,
-            trajectory,
+            known.law,
             recruitment_start() if anew else memory,
-            seconds(nanoseconds(samples.stamp[row])),
+            seconds(now),
             samples.strain[row],
             samples.force[row],
             samples.source_pressure[row],
@@ -420,7 +428,7 @@ def replay_controllers(
         if topic == REFERENCE:
             answers = strain_answers(configuration, run, steps, report)
         elif topic == STATE:
-            answers = supervisor_answers(configuration, table, samples, steps, report)
+            answers = supervisor_answers(configuration, table, run, steps, report)
         else:
             answers = pressure_answers(configuration, run, steps, report)
         ticks = np.array(samples.tick, dtype=np.int64)[steps.row]

@@ -107,12 +107,17 @@ class Course(NamedTuple):
     weight: float
 
 
-def predictor(configuration: Configuration) -> Predictor:
-    """Return the predictor of ``configuration``; a live reference has no preview."""
+def predictor(configuration: Configuration, *, live: bool | None = None) -> Predictor:
+    """Return the predictor of ``configuration``; a ``live`` reference has no preview.
+
+    Unless it is told otherwise the reference is the configured one.
+    """
     p = configuration.recruitment
     kind = PREDICTORS.index(p.predictor)
+    if live is None:
+        live = configuration.reference.kind == 'topic'
     return Predictor(
-        CONSTANT_RATE if kind == PREVIEW and configuration.reference.kind == 'topic' else kind,
+        CONSTANT_RATE if kind == PREVIEW and live else kind,
         p.strain_rate_time_constant,
         p.minimum_strain_rate,
         p.prediction_horizon,
@@ -249,8 +254,11 @@ def simply_expected(course: Course, ahead: float) -> float:
 def modelled(course: Course, then: float, ahead: float) -> float:
     """Return the strain ``ahead`` s from now by the reference, the parabola or the sinusoid.
 
-    ``then`` is the reference strain at that time.
+    ``then`` is the reference strain at that time. At constant rate there is nothing to learn of
+    it: a preview that takes over begins without prejudice.
     """
+    if course.kind == CONSTANT_RATE:
+        return simply_expected(course, ahead)
     if course.kind == PREVIEW:
         caught_up = 1.0 - math.exp(-ahead / TRACKING_TIME_CONSTANT)
         left = course.reference - course.position

@@ -56,18 +56,24 @@ class Recruitment(NamedTuple):
     minimum_dwell: float
     hold_all: bool
     reserve: float
+    return_rate: float
     own_flow: bool
     supply: HydraulicLaw
 
 
 class RecruitmentState(NamedTuple):
-    """What the law remembers: units recruited, filters, time in the state, downshift armed."""
+    """What the law remembers: units recruited, filters, time in the state, downshift armed.
+
+    ``failed`` is the strain at which the state below was seen at its end, infinite if it was not.
+    """
 
     recruited: int
     expected: PredictorState
     force: float
     dwell: float
     armed: bool
+    failed: float
+    below: float
     started: bool
 
 
@@ -86,11 +92,11 @@ class RecruitmentOutput(NamedTuple):
     prediction_error: float
 
 
-def recruitment(configuration: Configuration) -> Recruitment:
-    """Return the law of ``configuration``."""
+def recruitment(configuration: Configuration, *, live: bool | None = None) -> Recruitment:
+    """Return the law of ``configuration``; ``live`` is as for ``predictor``."""
     p, nominal = configuration.recruitment, configuration.source.nominal_pressure
     return Recruitment(
-        predictor=predictor(configuration),
+        predictor=predictor(configuration, live=live),
         lag_compensation=p.scheme in ('lag', 'lag_pressure'),
         pressure_compensation=p.scheme in ('pressure', 'lag_pressure'),
         upshift_pressure=p.upshift_threshold * nominal,
@@ -99,6 +105,7 @@ def recruitment(configuration: Configuration) -> Recruitment:
         minimum_dwell=p.minimum_dwell,
         hold_all=p.scheme == 'all',
         reserve=p.reserve,
+        return_rate=p.return_rate,
         own_flow=configuration.allocation.policy != ALLOCATIONS[BATCH],
         supply=hydraulic_law(configuration),
     )
@@ -109,7 +116,7 @@ def recruitment_start() -> RecruitmentState:
 
     Each run needs its own: the law writes in the predictor's forecasts.
     """
-    return RecruitmentState(1, predictor_start(), 0.0, math.inf, False, False)
+    return RecruitmentState(1, predictor_start(), 0.0, math.inf, False, math.inf, 0.0, False)
 
 
 @compiled
@@ -142,15 +149,17 @@ def taut_units(
     strain: float,
     force: float,
 ) -> int:
-    """Return how many units in a row, from the first on, carry a share of the ``force`` (N).
+    """Return how many units in a row, from the first on, are taut and carry of the ``force`` (N).
 
-    At least 1. So a supervisor that joins a running loop goes on with what is recruited.
+    By their pressure, for below strain zero an empty FAM carries by its bladder. At least 1. So a
+    supervisor that joins a running loop goes on with what is recruited.
     """
     count = 1
     while count < len(units):
         pressure, unit = mu_pressure[count], units[count]
-        carried = unit.fams * fam.force(unit.fam, max(pressure, 0.0), strain)
-        if pressure <= 0.0 or carried <= max(TAUT_SHARE * force, 0.0):
+        carried = unit.fams * fam.mesh_coefficient(unit.fam, strain) * pressure
+        slack = pressure <= max(fam.deslack_pressure(unit.fam, strain), 0.0)
+        if slack or carried <= TAUT_SHARE * force:
             break
         count += 1
     return count
@@ -160,11 +169,11 @@ def taut_units(
 def saturated(
     recruited: int, mu_pressure: npt.NDArray[np.float64], source_pressure: float
 ) -> bool:
-    """Return whether every recruited unit is at the source pressure already."""
+    """Return whether every recruited unit is at the source pressure already, if there is any."""
     for i in range(recruited):  # noqa: SIM110  numba has no all()
         if mu_pressure[i] < SATURATED * source_pressure:
             return False
-    return True
+    return source_pressure > 0.0
 
 
 @compiled
@@ -241,10 +250,13 @@ def recruitment_step(
         # that is over before the unit is taut needs none.
         if lag.lag < math.inf:
             lasts = stays_above(law.predictor, expected, reference, limit, lag.lag)
-    # Where the load does not move, no prediction says that the units are at their end.
-    if recruited < len(units) and saturated(recruited, mu_pressure, source_pressure):
+    # Where the load does not move, no prediction says that the units are at their end. A source
+    # below the table is off or failing: no state will help.
+    at_end = recruited < len(units) and saturated(recruited, mu_pressure, source_pressure)
+    at_end = at_end and source_pressure >= table.source_pressure[0]
+    if at_end:
         saturation, lasts = 0.0, lag.lag < math.inf
-    release = lag
+    release, reached = lag, -math.inf
     if recruited > 1 and may_fall(law.predictor, expected):
         newest_deslack = fam.deslack_pressure(units[newest].fam, strain)
         release = look_up(table, newest, source_pressure, newest_deslack)
@@ -252,28 +264,35 @@ def recruitment_step(
         effective = attainable_pressure(law, units, recruited - 1, *given)
         limit = modelled_strain(units, recruited - 1, effective, load)
         desaturation = time_to_fall(law.predictor, expected, reference, limit)
+        # However slow the fall, the strain may come back faster; and what the model says the
+        # lower state can hold is not believed where it was seen to fail.
+        reached = min(limit, state.failed) - law.return_rate * release.lag
         # The unit could not be recruited again before the dwell is over, nor be taut a lag later.
         again = release.lag + law.minimum_dwell
         comes_back = time_to_rise(law.predictor, expected, reference, limit) <= again
 
-    armed = state.armed
+    armed, below = state.armed, 0.0
     if law.lag_compensation:
         armed = armed or mu_pressure[newest] >= fam.deslack_pressure(units[newest].fam, strain)
         up = saturation <= lag.lag and lasts
-        down = desaturation <= -release.lag and not comes_back
+        down = desaturation <= -release.lag and strain <= reached and not comes_back
+        below = state.below + dt if down else 0.0
+        down = down and (not law.own_flow or below > release.lag)
     else:
         armed = armed or mu_pressure[newest] > law.downshift_pressure
         up = recruited < len(units) and mu_pressure[0] >= law.upshift_pressure
         down = mu_pressure[newest] <= law.downshift_pressure
-    dwell = state.dwell + dt
+    dwell, failed = state.dwell + dt, state.failed
     # A shift disturbs the very strain rate that the next decision rests on.
     if law.hold_all:
         dwell = 0.0
     elif up and dwell >= law.minimum_dwell:
         recruited, dwell, armed = recruited + 1, 0.0, False
+        failed = strain if at_end else math.inf
     elif recruited > 1 and down and armed and dwell >= law.minimum_dwell:
         # Below the top state the newest unit has been taut already.
         recruited, dwell, armed = recruited - 1, 0.0, True
+        failed = math.inf
     output = RecruitmentOutput(
         recruited,
         expected.strain_rate,
@@ -286,4 +305,4 @@ def recruitment_step(
         lag.outside,
         expected.error,
     )
-    return RecruitmentState(recruited, expected, load, dwell, armed, True), output
+    return RecruitmentState(recruited, expected, load, dwell, armed, failed, below, True), output

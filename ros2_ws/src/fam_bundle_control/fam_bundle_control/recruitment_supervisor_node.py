@@ -5,11 +5,13 @@ import sys
 
 import numpy as np
 
+from fam_bundle_control.announced import BEGINNING, NOTICE, Announced, Announcement
 from fam_bundle_control.recruitment import (
     recruitment,
     recruitment_start,
     recruitment_step,
 )
+from fam_bundle_control.trajectory import FROM_OUTSIDE, LIVE
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.compile import direct
 from fam_bundle_model.lag_table import PHYSICS, LagTable, lag_table_hash
@@ -17,9 +19,10 @@ from fam_bundle_model.parameters import seconds
 from fam_bundle_model.reference import reference_law
 from fam_bundle_msgs.msg import BundleState, RecruitmentState
 from fam_bundle_msgs.msg import LagTable as LagTableMessage
-from fam_bundle_node.lag_table_message import from_message
+from fam_bundle_msgs.msg import Reference as ReferenceMessage
+from fam_bundle_node import lag_table_message, reference_message
 from fam_bundle_node.loop_node import Controller
-from fam_bundle_node.qos import LATCHED
+from fam_bundle_node.qos import CHANGES, LATCHED
 from fam_bundle_node.run import run_node
 from fam_bundle_node.stamps import nanoseconds
 
@@ -32,14 +35,18 @@ class RecruitmentSupervisor(Controller):
         super().__init__(
             'recruitment_supervisor', ('recruitment', 'allocation', 'reference', *PHYSICS)
         )
-        self.law = recruitment(self.configuration)
+        self.laws = [recruitment(self.configuration, live=live) for live in (False, True)]
         self.units = motor_units(self.configuration)
-        self.trajectory = reference_law(self.configuration.reference)
+        reference = self.configuration.reference
+        self.first = Announcement(BEGINNING, reference_law(reference), reference.kind == LIVE)
+        self.announced = Announced(self.first, NOTICE)
         self.table: LagTable | None = None
         self.message = RecruitmentState()
         self.restart()
         self.publisher = self.loop_publisher(RecruitmentState, 'recruitment_state')
         self.create_subscription(LagTableMessage, 'lag_table', self.on_lag_table, LATCHED)
+        if self.configuration.recruitment.predictor == 'preview':
+            self.create_subscription(ReferenceMessage, 'reference', self.on_reference, CHANGES)
 
     def restart(self) -> None:
         """Find the recruited motor units from their pressures."""
@@ -56,26 +63,54 @@ class RecruitmentSupervisor(Controller):
             return
         first = self.table is None
         try:
-            self.table = from_message(message)
+            self.table = lag_table_message.from_message(message)
         except ValueError as error:
             self.fail(f'lag_table: its parts do not fit together ({error})')
             return
         if first:
-            model = (self.law, self.units, self.table, self.trajectory, recruitment_start())
+            law, trajectory = self.laws[False], self.first.law
+            model = (law, self.units, self.table, trajectory, recruitment_start())
             measured = (0.0, 0.0, 0.0, 0.0, np.zeros(len(self.units)), 1.0)
             self.decide = direct(recruitment_step, *model, *measured)
             self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state)
 
+    def on_reference(self, message: ReferenceMessage) -> None:
+        """Take note of a trajectory that will be tracked."""
+        law = self.first.law
+        if message.kind in FROM_OUTSIDE:
+            try:
+                law = reference_message.from_message(message)
+            except ValueError as error:
+                self.fail(f'reference: its parts do not fit together ({error})')
+                return
+        since = nanoseconds(message.header.stamp) or BEGINNING
+        late = self.announced.add(Announcement(since, law, message.kind == LIVE))
+        if late:
+            self.miss(late)
+
+    def miss(self, late: int) -> None:
+        """Say that news of a trajectory came too late for its ticks, by ``late`` ns."""
+        reason = f'reference: came {1e-6 * late:g} ms too late to be foreseen in time'
+        if self.realtime:
+            self.counts.late += 1
+            self.get_logger().warning(reason)
+        else:
+            self.fail(reason)
+
     def on_bundle_state(self, seen: BundleState) -> None:
         """Answer one tick."""
         dt = self.time_step(seen)
+        if seen.tick == 0:
+            self.announced.begin()
+        now = nanoseconds(seen.header.stamp)
+        known = self.announced.at(now)
         self.memory, output = self.decide(
-            self.law,
+            self.laws[known.live],
             self.units,
             self.table,
-            self.trajectory,
+            known.law,
             self.memory,
-            seconds(nanoseconds(seen.header.stamp)),
+            seconds(now),
             seen.strain,
             seen.force,
             seen.source_pressure,

@@ -22,7 +22,8 @@ from fam_bundle_model.schema import ConfigurationError, make_group
 
 MOST_GOAL_SAMPLES = 1000  # more would hold the loop up while they are checked
 MOST_GOAL_CYCLES = 500  # of random waypoints, for the same reason
-GOAL, RETURN = 'goal', 'return'
+LIVE, GOAL, RETURN = 'topic', 'goal', 'return'
+FROM_OUTSIDE = (LIVE, GOAL, RETURN)  # kinds of trajectory that no parameter tells
 
 
 def goal_parameters(
@@ -41,7 +42,7 @@ def goal_parameters(
             )
     given = {name: value for name, value in goal.items() if value}
     parameters = make_group(ReferenceParameters, 'reference', {**vars(configured), **given})
-    if parameters.kind == 'topic':
+    if parameters.kind == LIVE:
         raise ConfigurationError('reference.kind = topic: must be another in a goal')
     if parameters.kind == 'random' and parameters.cycles > MOST_GOAL_CYCLES:
         raise ConfigurationError(

@@ -21,11 +21,14 @@ def to_message(law: Reference, kind: str) -> ReferenceMessage:
 
 
 def from_message(message: ReferenceMessage) -> Reference:
-    """Return the trajectory in ``message``; raises ValueError when its parts do not fit."""
+    """Return the trajectory in ``message``.
+
+    Raises ValueError when its parts do not fit, or where it has no strain at some time.
+    """
     breaks = np.array(message.breaks, np.float64)
     if breaks.size == 0:
         raise ValueError('it has no polynomial')
-    return Reference(
+    law = Reference(
         float(message.start),
         float(message.end),
         float(message.cycle),
@@ -33,3 +36,8 @@ def from_message(message: ReferenceMessage) -> Reference:
         breaks,
         np.array(message.coefficients, np.float64).reshape(breaks.size, ORDER),
     )
+    if not all(np.isfinite(part).all() for part in law._replace(cycle=0.0)):
+        raise ValueError('a number is not finite')
+    if not law.cycle > 0.0:
+        raise ValueError(f'cycle = {law.cycle:g} s: must be > 0')
+    return law
