@@ -75,6 +75,13 @@ def test_demo_writes_all_its_results(
         assert f'{demo.PAPER[scheme].iae:.4f}' in printed
 
 
+def test_another_scheme_keeps_all_else(quick: Callable[..., Configuration]) -> None:
+    mine = quick(allocation={'policy': 'orderly', 'feedforward': 0.5})
+    for policy in ('batch', 'force'):
+        changed = demo.with_scheme(mine, 'lag', allocation=policy)
+        assert changed == quick('lag', allocation={'policy': policy, 'feedforward': 0.5})
+
+
 def test_a_demo_takes_only_its_own_bag_away(tmp_path: Path) -> None:
     bag = tmp_path / 'bag'
     demo.remove_bag(bag)

@@ -18,17 +18,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fam_bundle_bringup import hindsight, study_command, study_run
+from fam_bundle_bringup import hindsight, study_case, study_command, study_run
 from fam_bundle_bringup.cli import main
 from fam_bundle_bringup.experiment import measure_tracking
 from fam_bundle_bringup.hindsight import with_threshold
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_bringup.study import Study, cases_of, read_study
-from fam_bundle_bringup.study_case import MEASURED, Setting, run_case
+from fam_bundle_bringup.study_case import MEASURED, Row, Setting, measured, run_case
 from fam_bundle_bringup.study_command import print_summary, run_cases
-from fam_bundle_bringup.study_result import read_result
+from fam_bundle_bringup.study_result import read_result, result_of, write_result
 from fam_bundle_bringup.study_run import Done, Job, Journal
-from fam_bundle_io.metrics import shift_times
+from fam_bundle_io.metrics import NotMeasurable, shift_times
 from fam_bundle_model.schema import ConfigurationError
 
 SMALL = """
@@ -154,6 +154,41 @@ def test_diverging_case_is_a_row_and_no_end(here: Here, tmp_path: Path) -> None:
     assert columns['status'] == ['diverged', 'ok']
     assert 'is not finite; the plant diverges' in columns['reason'][0]
     assert columns['iae'][0] is None and columns['iae'][1] > 0.0
+
+
+def test_mistake_in_a_run_is_no_row(
+    here: Here, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The journal would keep it, and the case would never be run again."""
+
+    def mistaken(*_: Any, **__: Any) -> None:
+        raise ValueError('operands could not be broadcast together')
+
+    study, out = written(tmp_path, SMALL), tmp_path / 'out'
+    with monkeypatch.context() as patched:
+        patched.setattr(study_case, 'run_offline', mistaken)
+        with pytest.raises(ValueError, match='broadcast'):
+            run_cases(study, out, workers=1)
+    assert 'diverged' not in (out / 'rows.jsonl').read_text()
+    assert run_cases(study, out, workers=1).columns['status'].count('ok') == 4
+
+
+def test_trace_that_is_too_short_or_not_finite_is_a_row_without_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    setting = quick('changes: {reference.cycles: 1, reference.frequency: 1.0}', tmp_path)
+    trace = run_offline(setting.believed)
+    short = {name: values[:1] for name, values in trace.items()}
+    for spoilt, words in (
+        (short, 'no ticks from'),
+        ({**trace, 'force': np.full_like(trace['force'], np.nan)}, 'not finite'),
+    ):
+        with pytest.raises(NotMeasurable, match=words):
+            measured(setting, spoilt)
+        monkeypatch.setattr(study_case, 'run_offline', lambda *_, trace=spoilt, **__: trace)
+        row = run_case(setting)
+        assert row['status'] == 'diverged' and words in row['reason']
+        assert all(row[name] is None for name in MEASURED)
 
 
 def test_nothing_that_can_be_run_is_refused(here: Here, tmp_path: Path) -> None:
@@ -445,6 +480,37 @@ def test_csv_holds_the_same_values(
                     assert text == ('' if value is None else str(value))
     assert read_result(tmp_path).columns['iae'] == whole['iae']
     assert json.loads((tmp_path / 'study.json').read_text())['study_text'] == study.text
+
+
+LABELS = """
+schemes: [baseline, lag]
+grid:
+  bundle:
+    '4': {fam.count: [4], sensors.seed: 7}
+    '2 2': {fam.count: [2, 2], load.mass: 17}
+    'nan': {fam.count: [2, 2]}
+    '1e5': {recruitment.upshift_threshold: 0.3, recruitment.downshift_threshold: 0.4}
+    '': {fam.length: 0.25}
+  sensors.strain_noise: [0.0, 1.0e-5]
+rivals: [always_recruited]
+"""
+
+
+@pytest.mark.parametrize('as_csv', [True, False])
+def test_result_reads_back_as_what_was_written(tmp_path: Path, as_csv: bool) -> None:
+    study = written(tmp_path, LABELS)
+    cases = cases_of(study)
+    row: Row = {'status': 'ok', 'reason': '', **dict.fromkeys(MEASURED, 2.0)}
+    row |= {'upshifts': 3, 'shortest_interval': None}
+    rows = dict.fromkeys(study_run.jobs_of(cases, study.rivals, 'here'), row)
+    result = result_of(study, cases, rows, 'here', {})
+    assert result.columns['bundle'][::4] == ['4', '2 2', 'nan', '1e5', '']
+    assert result.columns['status'].count('impossible') == 4
+    write_result(result, tmp_path, as_csv)
+    read = read_result(tmp_path)
+    assert read == result
+    for name, cells in result.columns.items():  # for 3 == 3.0
+        assert list(map(type, read.columns[name])) == list(map(type, cells)), name
 
 
 def test_figures_only_runs_nothing(

@@ -16,7 +16,7 @@ from fam_bundle_bringup.progress import progress_bar
 from fam_bundle_io.metrics import Tracking, Window, slice_of
 from fam_bundle_io.shapes import Claim, paper_claims
 from fam_bundle_io.trace import Trace
-from fam_bundle_model.parameters import PAPER_SCHEMES, AllocationParameters, Configuration
+from fam_bundle_model.parameters import PAPER_SCHEMES, Configuration
 from fam_bundle_model.schema import ConfigurationError
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def with_scheme(
     return dataclasses.replace(
         configuration,
         recruitment=dataclasses.replace(configuration.recruitment, scheme=scheme),
-        allocation=AllocationParameters(policy=allocation),
+        allocation=dataclasses.replace(configuration.allocation, policy=allocation),
     )
 
 

@@ -12,8 +12,9 @@ from fam_bundle_bringup.experiment import check_feasible, last_cycle
 from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_bringup.hindsight import THRESHOLDS, best_threshold, with_threshold
 from fam_bundle_bringup.offline import run_offline
-from fam_bundle_io.energy import energy, powers
+from fam_bundle_io.energy import energy, powers, summary
 from fam_bundle_io.metrics import (
+    NotMeasurable,
     Window,
     needless_shifts,
     shift_times,
@@ -70,27 +71,23 @@ def measured(setting: Setting, trace: Trace) -> Row:
     """Return the numbers of a whole run, in SI units.
 
     Tracking and energy are taken over the window of the metrics, the last cycle; shifts over the
-    whole run. Raises ValueError where the trace does not reach that far or is not finite.
+    whole run. Raises NotMeasurable where the trace does not reach that far or is not finite.
     """
     window = Window(*last_cycle(setting.believed))
+    tracked = tracking(trace, *window)
     inside = ticks_in(trace, window)
     error = (trace['strain_reference'] - trace['strain'])[inside]
     up, down = shift_times(trace)
     interval = shortest_interval(trace)
     spent = energy(trace, powers(trace, setting.rig()), window)
-    efficiency = spent.efficiency
     return {
-        **tracking(trace, *window)._asdict(),
+        **tracked._asdict(),
         'rms_error': float(np.sqrt(np.mean(error**2))),
         'upshifts': len(up),
         'downshifts': len(down),
         'needless_shifts': needless_shifts(trace),
         'shortest_interval': interval if np.isfinite(interval) else None,
-        'hydraulic_input': spent.hydraulic_input,
-        'output': spent.output,
-        'returned': spent.returned,
-        'throttling_loss': sum(spent.supply_loss) + sum(spent.return_loss),
-        'efficiency': efficiency if np.isfinite(efficiency) else None,
+        **summary(spent),
     }
 
 
@@ -103,17 +100,16 @@ def run_case(setting: Setting) -> Row:
     """Return the row of one case: ``status``, ``reason`` and what it is measured by.
 
     ``status`` is ``ok``; ``unreachable`` where the rig cannot do it, which is then not tried;
-    ``diverged`` where the run ended early.
+    ``diverged`` where the run ended early or gave nothing that can be measured.
     """
     try:
         setting.check()
-    except ConfigurationError as error:
-        return not_run('unreachable', str(error))
-    try:
         table = lag_table_of(setting.believed)
         trace = run_offline(setting.believed, table=table, actual=setting.actual)
         return {'status': 'ok', 'reason': '', **measured(setting, trace)}
-    except (RunFailed, ValueError) as error:
+    except ConfigurationError as error:
+        return not_run('unreachable', str(error))
+    except (RunFailed, NotMeasurable) as error:
         return not_run('diverged', str(error))
 
 

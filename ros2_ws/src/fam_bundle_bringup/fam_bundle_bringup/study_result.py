@@ -25,7 +25,10 @@ RATIOS = ('iae', 'max_error')
 
 
 class Result(NamedTuple):
-    """Columns of one value for each case, None where there is none; and their provenance."""
+    """Columns of one value for each case, and their provenance.
+
+    A number that there is not is None, a text that there is not is empty.
+    """
 
     columns: dict[str, list[Any]]
     provenance: dict[str, Any]
@@ -52,9 +55,11 @@ def result_of(
         for name in RATIOS:
             both = zip(own, theirs, strict=True)
             columns[f'{rival}.{name}_ratio'] = [_ratio(a[name], b[name]) for a, b in both]
-    hashes = [case.setting and case.setting.hash() for case in cases]
-    columns['parameters_hash'] = hashes
-    return Result(columns, {**provenance_of(study, made_by), **run})
+    columns['parameters_hash'] = [case.setting and case.setting.hash() for case in cases]
+    # A CSV file cannot tell None from empty text, nor the label '4' from a number.
+    text = [name for name, cells in columns.items() if any(isinstance(c, str) for c in cells)]
+    columns |= {name: [cell or '' for cell in columns[name]] for name in text}
+    return Result(columns, {**provenance_of(study, made_by), 'text_columns': text, **run})
 
 
 def _plain(value: Any) -> Any:
@@ -138,19 +143,23 @@ def read_result(folder: Path) -> Result:
             return Result(table.to_pydict(), json.loads(table.schema.metadata[KEY]))
         with (folder / 'study.csv').open(encoding='utf-8', newline='') as file:
             names, *rows = csv.reader(file)
-        cells = [[_value(cell) for cell in column] for column in zip(*rows, strict=True)]
         provenance = json.loads((folder / 'study.json').read_text(encoding='utf-8'))
-        return Result(dict(zip(names, cells, strict=True)), provenance)
+        cells: dict[str, list[Any]] = dict(
+            zip(names, map(list, zip(*rows, strict=True)), strict=True)
+        )
+        for name in cells.keys() - set(provenance['text_columns']):
+            cells[name] = [_number(cell) for cell in cells[name]]
+        return Result(cells, provenance)
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = ' '.join(str(error).split())
         raise ConfigurationError(f'{folder}: holds no result of a study ({reason})') from None
 
 
-def _value(cell: str) -> Any:
-    """Return what a cell of a CSV file stands for; text that is no number stays text."""
-    for kind in (int, float):
-        try:
-            return kind(cell)
-        except ValueError:
-            continue
-    return cell or None
+def _number(cell: str) -> float | None:
+    """Return the number in a cell of a CSV file, None where there is none."""
+    if not cell:
+        return None
+    try:
+        return int(cell)
+    except ValueError:
+        return float(cell)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from fam_bundle_io.metrics import Window, steps, ticks_in
+from fam_bundle_io.metrics import NotMeasurable, Window, steps, ticks_in
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.hydraulics import HydraulicLaw, hydraulic_law, unit_flow
@@ -139,7 +139,7 @@ def _contracting(strain: Array, step: float) -> npt.NDArray[np.bool_]:
 def energy(trace: Trace, found: Powers, window: Window, state: int | None = None) -> Energy:
     """Return what the powers ``found`` in ``trace`` come to within ``window``.
 
-    Only of the ticks with ``state`` units recruited, if that is given. Raises ValueError where
+    Only of the ticks with ``state`` units recruited, if that is given. Raises NotMeasurable where
     something in it is not finite.
     """
     inside = ticks_in(trace, window)
@@ -148,7 +148,7 @@ def energy(trace: Trace, found: Powers, window: Window, state: int | None = None
     step = steps(trace)[inside]
     for power in (found.source, found.load, found.relieved, found.supply_loss, found.return_loss):
         if not np.isfinite(power[inside]).all():
-            raise ValueError('a power is not finite')
+            raise NotMeasurable('a power is not finite')
 
     def total(power: Array) -> float:
         return float((power[inside] * step).sum())
@@ -191,7 +191,7 @@ def energy_by_state(trace: Trace, found: Powers, window: Window) -> dict[int, En
     """Return ``energy`` of each number of recruited units that occurs within ``window``.
 
     Energies add up to those of the window. What is stored in one state and spent in another
-    stands in ``unexplained`` of both. Raises ValueError where something is not finite.
+    stands in ``unexplained`` of both. Raises NotMeasurable where something is not finite.
     """
     states = np.unique(trace['recruitment_state'][ticks_in(trace, window)])
     return {int(state): energy(trace, found, window, int(state)) for state in states}

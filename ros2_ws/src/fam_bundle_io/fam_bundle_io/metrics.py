@@ -16,6 +16,10 @@ SLACK = 1e-9  # s by which rounding may move the edge of a window
 SWING = 0.05  # share of the reference's range by which it must turn to ask for another shift
 
 
+class NotMeasurable(ValueError):
+    """A trace of which something cannot be measured: it is too short, or not finite."""
+
+
 class Tracking(NamedTuple):
     """Integral absolute strain error in s, and largest absolute strain error."""
 
@@ -36,11 +40,11 @@ def tracking(trace: Trace, start: float, stop: float) -> Tracking:
     Each tick stands for the time until the next one, or until ``stop``: in real time periods can
     be skipped.
 
-    Raises ValueError when the trace has fewer than two ticks in that window.
+    Raises NotMeasurable when the trace has fewer than two ticks in that window.
     """
     window = ticks_in(trace, Window(start, stop))
     if np.count_nonzero(window) < 2:
-        raise ValueError(f'the trace has no ticks from {start:g} s to {stop:g} s')
+        raise NotMeasurable(f'the trace has no ticks from {start:g} s to {stop:g} s')
     error = np.abs(trace['strain_reference'] - trace['strain'])[window]
     step = np.diff(trace['time'][window], append=stop)
     return Tracking(float((error * step).sum()), float(error.max()))
