@@ -207,6 +207,21 @@ def ladder(folder: Path) -> str:
     return '\n\n'.join(parts)
 
 
+def chatter(folder: Path) -> str:
+    """Return in how many cases each scheme shifts without need, by allocation and noise."""
+    rows = load(folder, 'chatter')
+    keys = ['allocation.policy', 'sensors.strain_noise']
+    columns = list(rows.groupby(keys).groups)
+    table = []
+    for scheme, found in rows.groupby('recruitment.scheme', sort=False):
+        cells = {
+            key: f'{(one.needless_shifts > 0).sum()} of {len(one)}'
+            for key, one in found.groupby(keys)
+        }
+        table.append([str(scheme), *(cells.get(column, '-') for column in columns)])
+    return markdown(['scheme', *(f'{name}, noise {noise:g}' for name, noise in columns)], table)
+
+
 STUDIES: tuple[Callable[[Path], str], ...] = (
     grid,
     references,
@@ -214,6 +229,7 @@ STUDIES: tuple[Callable[[Path], str], ...] = (
     wrong_model,
     reserve,
     ladder,
+    chatter,
 )
 
 
