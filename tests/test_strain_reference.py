@@ -33,6 +33,7 @@ from fam_bundle_bringup.replay_controllers import (
     strain_answers,
     supervisor_answers,
 )
+from fam_bundle_control import strain_controller_node
 from fam_bundle_control.announced import NOTICE
 from fam_bundle_control.recruitment import RecruitmentOutput
 from fam_bundle_control.recruitment_supervisor_node import RecruitmentSupervisor
@@ -41,6 +42,7 @@ from fam_bundle_model.bundle import modelled_strain, motor_units
 from fam_bundle_model.lag_table import cached_lag_table, lag_table_hash
 from fam_bundle_model.parameters import Configuration, load_configuration, write_yaml
 from fam_bundle_model.reference import reference_law, strain_reference
+from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_msgs.action import TrackStrain
 from fam_bundle_msgs.msg import (
     BundleState,
@@ -71,7 +73,7 @@ class Bundle(Node):
         self.strains: list[float] = []
         self.laws: list[Reference] = []
         self.states: list[tuple[Any, ...]] = []
-        self.supervised = False
+        self.supervised = self.safe = False
         self.until = 0
         self.out = self.create_publisher(BundleState, 'bundle_state', LOOP_PUBLISHER)
         self.live = self.create_publisher(StrainReference, 'strain_reference', NEWEST)
@@ -98,7 +100,7 @@ class Bundle(Node):
         message = BundleState(tick=tick, strain=strain, source_pressure=6.8e5, force=WEIGHT)
         nanoseconds = tick * 1_000_000
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
-        message.mu_pressure = [1e5, 0.0]
+        message.mu_pressure, message.safe = [1e5, 0.0], self.safe
         self.out.publish(message)
 
     def answered(self, answer: PressureReference) -> None:
@@ -295,6 +297,65 @@ def test_a_cancelled_goal_goes_back_smoothly_before_it_is_cancelled(rig: Rig) ->
     assert np.abs(np.diff(rig.bundle.references, 2))[200:].max() <= 4.0 * PERIOD**2 * 1.01
 
 
+@pytest.mark.parametrize('since', [0.6, 1.2])
+def test_a_cancel_drives_the_strain_no_higher_than_braking_takes(rig: Rig, since: float) -> None:
+    """The sine peaks at 0.14; all that the bundle can hold is 0.1505."""
+    rig.run(0.1)
+    handle = rig.send(kind='sine', amplitude=0.07, frequency=0.3, cycles=3)
+    rig.run(from_message(rig.bundle.laws[-1]).start + since - 0.1)
+    before = rig.bundle.references[-1]
+    speed = (before - rig.bundle.references[-2]) / PERIOD
+    assert speed > 0.08
+    rig.spin(handle.cancel_goal_async().done)
+    rig.run(4.0)
+    assert rig.end_of(handle)[0] == GoalStatus.STATUS_CANCELED
+    assert max(rig.bundle.references) == pytest.approx(before + 0.5 * speed**2, abs=1e-4)
+    assert rig.bundle.references[-1] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_no_goal_is_tracked_while_the_plant_is_safe(
+    rig: Rig, capfd: pytest.CaptureFixture[str]
+) -> None:
+    rig.run(0.1)
+    handle = rig.send(kind='sine', amplitude=0.05, frequency=0.2, cycles=2, **SLOW)
+    rig.run(1.5)
+    rig.bundle.safe = True
+    rig.run(0.5)
+    status, result = rig.end_of(handle)
+    assert status == GoalStatus.STATUS_ABORTED
+    assert result.message == 'the plant is safe and follows nothing'
+    assert result.samples < 1600
+    references = np.array(rig.bundle.references)
+    speed = (references[1599] - references[1598]) / PERIOD
+    held = references[1600] + 0.5 * speed**2 / SLOW['strain_acceleration']
+    assert references[-1] == pytest.approx(held, abs=1e-4)
+    assert set(references[-400:]) == {references[-1]}
+    rig.spin(lambda: [law.kind for law in rig.bundle.laws] == ['sine', 'goal', 'hold'])
+    assert strain_reference(from_message(rig.bundle.laws[-1]), 99.0) == references[-1]
+
+    assert not rig.send(kind='ramp', amplitude=0.02).accepted
+    said = capfd.readouterr().err
+    assert 'track_strain: the plant is safe and follows nothing; rejected' in said
+    rig.bundle.safe = False
+    rig.run(0.1)
+    assert set(rig.bundle.references[-400:]) == {references[-1]}
+    assert rig.send(kind='ramp', amplitude=0.02).accepted
+
+
+def test_a_goal_that_nobody_drives_is_given_up_and_its_reference_held(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig.run(0.1)
+    handle = rig.send(kind='sine', amplitude=0.05, frequency=0.2, cycles=2, **SLOW)
+    rig.run(1.5)
+    monkeypatch.setattr(strain_controller_node, 'PATIENCE', 0.1)
+    status, result = rig.end_of(handle)
+    assert (status, result.message) == (GoalStatus.STATUS_ABORTED, 'bundle_state stayed away')
+    rig.run(1.0)
+    assert rig.bundle.laws[-1].kind == 'hold'
+    assert len(set(rig.bundle.references[-900:])) == 1
+
+
 def test_what_cannot_be_tracked_is_rejected_and_disturbs_nothing(
     rig: Rig, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -317,6 +378,13 @@ def test_what_cannot_be_tracked_is_rejected_and_disturbs_nothing(
         ({'kind': 'random', 'cycles': 501}, 'reference.cycles = 501: must be <= 500'),
         ({'kind': 'sum_of_sines', 'multiples': [1000.0], 'frequency': 9.0}, 'must be 1 or 1'),
         ({'kind': 'steps', 'strain_rate': 1e-3}, 'reference.levels: a step of '),
+        ({'strain_acceleration': 1e-300}, 'reference.strain_acceleration = 1e-300 1/s^2: must be'),
+        ({'strain_acceleration': 1e-310}, 'must be >= 0.001 and <= 1000'),
+        ({'strain_rate': 1e-310}, '1/s: must be >= 0.0001 and <= 10'),
+        (
+            {'kind': 'samples', 'times': [0.0, 1e-70, 1.0], 'strains': [0.0, 0.01, 0.0]},
+            'reference.times[1] = 1e-70 s: must be >= 1e-06 s after 0 s, the one before',
+        ),
     ):
         assert not rig.send(**goal).accepted, goal
         said = capfd.readouterr().err
@@ -357,6 +425,18 @@ def test_a_new_run_ends_a_goal_and_begins_with_the_configured_reference(rig: Rig
     law = reference_law(configured().reference)
     assert rig.bundle.references == [strain_reference(law, time_of(k)) for k in range(100)]
     rig.spin(lambda: [law.kind for law in rig.bundle.laws] == ['sine', 'goal', 'sine'])
+
+
+def test_a_parameter_without_a_value_is_refused() -> None:
+    """To rcl an empty list has no type, and rclpy would declare the parameter as not set."""
+    given = ['--params-file', str(default_configuration()), '-p', 'reference.levels:=[]']
+    with own_domain():
+        rclpy.init(args=['--ros-args', *given])
+        try:
+            with pytest.raises(ConfigurationError, match=r'^reference\.levels = \[\]: must hold'):
+                StrainController()
+        finally:
+            rclpy.try_shutdown()
 
 
 # ---- Live values ----

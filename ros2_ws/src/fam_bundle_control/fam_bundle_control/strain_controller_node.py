@@ -31,6 +31,7 @@ from fam_bundle_node.ticked_action import TickedAction
 GOAL_FIELDS = tuple(declarations(ReferenceParameters))
 FEEDBACK_PERIOD = 0.05  # s of the run
 PATIENCE = 5.0  # s without a sample after which a goal is given up
+SAFE = 'the plant is safe and follows nothing'
 WARNING_PERIOD = 1.0  # s between two warnings of live values that are not taken
 
 
@@ -57,6 +58,7 @@ class StrainController(Controller):
         self.trajectory = Trajectory(self.configuration, reachable(self.configuration, self.units))
         self.reference = direct(strain_reference, self.trajectory.law, 0.0)
         self.time: float | None = None
+        self.safe = False
         self.stamp = Time()
         self.message = PressureReference()
         self.restart()
@@ -90,6 +92,7 @@ class StrainController(Controller):
         if seen.tick == 0:
             self.begin_run()
         self.stamp, self.time = seen.header.stamp, seconds(nanoseconds(seen.header.stamp))
+        self.safe = seen.safe
         reference = self.reference(self.trajectory.law, self.time)
         self.state_of_law, output = self.step(
             self.law,
@@ -143,10 +146,12 @@ class StrainController(Controller):
         try:
             if self.time is None:
                 raise ConfigurationError('no bundle_state has come yet')
+            if self.safe:
+                raise ConfigurationError(SAFE)
             period = configuration.simulation.period
             parameters = goal_parameters(configuration.reference, lists, period)
             self.planned = self.trajectory.plan(parameters, self.time), parameters
-        except ConfigurationError as error:
+        except (ValueError, ArithmeticError) as error:  # no goal may end the node
             self.get_logger().warning(f'track_strain: {error}; rejected')
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
@@ -168,6 +173,9 @@ class StrainController(Controller):
     def follow_goal(self, strain: float, error: float, dt: float) -> None:
         """Score one tick, tell how it goes, and see whether the goal is done."""
         since = self.time - self.trajectory.law.start
+        if self.safe:
+            self.give_up(SAFE)
+            return
         if self.trajectory.is_done(self.time):
             self.end_goal('')
             return
@@ -177,6 +185,12 @@ class StrainController(Controller):
             self.next_feedback = self.time + FEEDBACK_PERIOD
             feedback = TrackStrain.Feedback(time=since, strain=strain, error=error)
             self.goal.publish_feedback(feedback)
+
+    def give_up(self, why: str) -> None:
+        """End the goal early; the reference is held."""
+        self.trajectory.hold(self.time)
+        self.announce()
+        self.end_goal(why)
 
     def end_goal(self, why: str) -> None:
         """End the goal: as reached, or cancelled, or early."""
@@ -188,7 +202,7 @@ class StrainController(Controller):
         """Give a goal up when the loop has stopped, besides what every node does."""
         super().look_after()
         if self.goal is not None and time.monotonic() - self._tick_at > PATIENCE:
-            self.end_goal('bundle_state stayed away')
+            self.give_up('bundle_state stayed away')
 
     def close(self) -> None:
         """End the action too."""

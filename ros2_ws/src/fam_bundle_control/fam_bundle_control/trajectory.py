@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which reference is tracked: the configured one, live values, a goal, or the way back from it."""
+"""Which reference is tracked: the configured one, live values, a goal, or what comes after it."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,6 +14,7 @@ from fam_bundle_model.parameters import (
 from fam_bundle_model.reference import (
     Reference,
     after,
+    braked,
     reference_law,
     slewed,
     still,
@@ -22,8 +23,8 @@ from fam_bundle_model.schema import ConfigurationError, make_group
 
 MOST_GOAL_SAMPLES = 1000  # more would hold the loop up while they are checked
 MOST_GOAL_CYCLES = 500  # of random waypoints, for the same reason
-LIVE, GOAL, RETURN = 'topic', 'goal', 'return'
-FROM_OUTSIDE = (LIVE, GOAL, RETURN)  # kinds of trajectory that no parameter tells
+LIVE, GOAL, RETURN, HOLD = 'topic', 'goal', 'return', 'hold'
+FROM_OUTSIDE = (LIVE, GOAL, RETURN, HOLD)  # kinds of trajectory that no parameter tells
 
 
 def goal_parameters(
@@ -100,7 +101,7 @@ class Trajectory:
         """
         if self.busy:
             raise ConfigurationError('a goal is tracked already')
-        limits = goal.strain_rate, goal.strain_acceleration
+        limits = goal.strain_rate, goal.strain_acceleration, self._reach
         law = after(self.law, time, reference_law(goal), *limits)
         check_within_reach(law, 'goal', self._reach, self._pressure)
         return law
@@ -111,8 +112,13 @@ class Trajectory:
 
     def turn_back(self, time: float) -> None:
         """Go from a goal to the strain at which the run began, within the goal's limits."""
-        limits = self._limits.strain_rate, self._limits.strain_acceleration
+        limits = self._limits.strain_rate, self._limits.strain_acceleration, self._reach
         self.kind, self.law = RETURN, after(self.law, time, still(self._rest), *limits)
+
+    def hold(self, time: float) -> None:
+        """Brake a goal within its limits, and stay where it comes to rest."""
+        acceleration = self._limits.strain_acceleration
+        self.kind, self.law = HOLD, braked(self.law, time, acceleration, self._reach)
 
     def is_done(self, time: float) -> bool:
         """Return whether the goal, or the way back from it, has come to its end at ``time``."""

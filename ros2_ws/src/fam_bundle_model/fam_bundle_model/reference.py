@@ -24,7 +24,11 @@ Floats = float | Array
 ORDER = 6  # coefficients of a piece
 FINENESS = 33  # points at which a piece is looked at for its extremes
 SHORTEST = 1e-3  # s that a way takes at least
-LONGER = 1.1  # what is too fast takes so much longer at the next try
+MOMENT = 1e-6  # s; what is braked in less than that stops at once
+ANYWHERE = (-math.inf, math.inf)
+# The largest rate of the way of least jerk from rest to rest over the mean one, and the largest
+# acceleration over distance by time squared.
+LEAST_JERK_RATE, LEAST_JERK_ACCELERATION = 15.0 / 8.0, 10.0 / math.sqrt(3.0)
 
 
 class Reference(NamedTuple):
@@ -254,28 +258,51 @@ def rate_of(law: Reference, time: float) -> float:
     return rate
 
 
-def after(
-    before: Reference, time: float, wanted: Reference, rate: float, acceleration: float
+def braked(
+    before: Reference, time: float, acceleration: float, reach: tuple[float, float] = ANYWHERE
 ) -> Reference:
-    """Return ``wanted``, begun as soon as a smooth way leads to it from ``before`` at ``time`` s.
+    """Return ``before`` brought to rest from ``time`` s on, and held where it comes to rest.
 
-    The way goes on from the strain and the strain rate of that time, ends at rest, and keeps to
-    ``rate`` (1/s; or to the present one where that is higher) and ``acceleration`` (1/s^2).
+    It is braked at ``acceleration`` (1/s^2), or as much harder as it takes to stay within
+    ``reach``, the lowest and the highest strain.
     """
-    start, stop = strain_reference(before, time), strain_reference(wanted, wanted.start)
-    present = rate_of(before, time)
-    if start == stop and present == 0.0:
-        return wanted._replace(start=time)
-    least = step_time(abs(stop - start), rate, acceleration)
-    taken = max(least, abs(present) / acceleration, SHORTEST)
-    while True:
-        way = quintic(start, present, stop, 0.0, taken)
-        fastest = _largest(np.polynomial.polynomial.polyder(way), taken)
-        hardest = _largest(np.polynomial.polynomial.polyder(way, 2), taken)
-        if fastest <= max(rate, abs(present)) and hardest <= acceleration:
-            break
-        taken *= LONGER
-    return _preceded(wanted, time, taken, way)
+    start, rate = strain_reference(before, time), rate_of(before, time)
+    room = max(reach[1] - start if rate > 0.0 else start - reach[0], 0.0)
+    distance = min(0.5 * rate * rate / acceleration, room)
+    taken = 2.0 * distance / abs(rate) if rate else 0.0
+    if taken < MOMENT:
+        return still(start)._replace(start=time)
+    way = np.zeros(ORDER)
+    way[:3] = start, rate, -0.5 * rate / taken
+    return _preceded(still(start + 0.5 * rate * taken), time, taken, way)
+
+
+def after(
+    before: Reference,
+    time: float,
+    wanted: Reference,
+    rate: float,
+    acceleration: float,
+    reach: tuple[float, float] = ANYWHERE,
+) -> Reference:
+    """Return ``wanted``, begun as soon as a way leads to its first strain from ``before``.
+
+    From ``time`` s on ``before`` is ``braked``; then the way of least jerk leads from rest to rest
+    within ``rate`` (1/s) and ``acceleration`` (1/s^2). One polynomial for both would go far beyond
+    the point of rest where it has to go back.
+    """
+    rest = braked(before, time, acceleration, reach)
+    start, stop = strain_reference(rest, rest.start), strain_reference(wanted, wanted.start)
+    distance = abs(stop - start)
+    law = wanted._replace(start=rest.start)
+    if distance > 0.0:
+        slow = LEAST_JERK_RATE * distance / rate
+        gentle = math.sqrt(LEAST_JERK_ACCELERATION * distance / acceleration)
+        taken = max(slow, gentle, SHORTEST)
+        law = _preceded(law, rest.start, taken, quintic(start, 0.0, stop, 0.0, taken))
+    if rest.start > time:
+        law = _preceded(law, time, rest.start - time, rest.coefficients[0])
+    return law
 
 
 def slewed(before: Reference, time: float, strain: float, rate: float) -> Reference:
@@ -302,13 +329,9 @@ def strain_range(law: Reference) -> tuple[float, float]:
 
 def _preceded(wanted: Reference, time: float, taken: float, way: Array) -> Reference:
     """Return ``wanted`` after a ``way`` that begins at ``time`` and takes so many seconds."""
+    first = wanted.breaks[0] - taken
     return wanted._replace(
-        start=time + taken,
-        breaks=np.concatenate(([-taken], wanted.breaks)),
+        start=float(time - first),
+        breaks=np.concatenate(([first], wanted.breaks)),
         coefficients=np.vstack((way, wanted.coefficients)),
     )
-
-
-def _largest(coefficients: npt.NDArray[np.floating], until: float) -> float:
-    times = np.linspace(0.0, until, FINENESS)
-    return float(np.abs(np.polynomial.polynomial.polyval(times, coefficients)).max())

@@ -21,6 +21,7 @@ from fam_bundle_model.parameters import (
 )
 from fam_bundle_model.reference import (
     after,
+    braked,
     quintic,
     rate_of,
     reference_law,
@@ -350,12 +351,58 @@ def test_a_new_trajectory_sets_in_without_a_jump_and_within_the_limits(
     assert later == pytest.approx(own, abs=1e-9)
 
 
+REACH = (-0.02, 0.15)
+
+
+@settings(deadline=None, max_examples=200)
+@given(
+    moments,
+    st.floats(0.005, 0.075),
+    st.floats(0.05, 2.0),
+    st.floats(1e-4, 10.0),
+    st.floats(1e-3, 1e3),
+    st.floats(*REACH),
+)
+def test_no_way_leads_beyond_the_rest_after_braking_nor_out_of_reach(
+    moment, amplitude, frequency, limit, acceleration, target
+):
+    """A mass point at the rate v comes to rest v^2/(2 a) further on."""
+    before = reference_law(of('sine', amplitude=amplitude, frequency=frequency, cycles=1000))
+    start, speed = strain_reference(before, moment), rate_of(before, moment)
+    rest = start + math.copysign(0.5 * speed**2 / acceleration, speed)
+    for law, ends in (
+        (after(before, moment, still(target), limit, acceleration, REACH), (rest, start, target)),
+        (braked(before, moment, acceleration, REACH), (rest, start)),
+    ):
+        times = np.linspace(moment, law.start, 1001)
+        strain = np.array([strain_reference(law, t) for t in times.tolist()])
+        assert max(REACH[0], min(ends)) - 1e-9 <= strain.min()
+        assert strain.max() <= min(REACH[1], max(ends)) + 1e-9
+        assert rate_of(law, law.start) == 0.0
+
+
+def test_it_is_braked_at_the_acceleration_or_as_much_harder_as_the_reach_wants():
+    before = reference_law(SINE)
+    start, speed = strain_reference(before, 2.0), rate_of(before, 2.0)
+    free = braked(before, 2.0, 0.1)
+    assert free.start - 2.0 == pytest.approx(speed / 0.1)
+    assert strain_reference(free, 99.0) == pytest.approx(start + 0.5 * speed**2 / 0.1)
+    near = braked(before, 2.0, 0.1, (0.0, start + 0.002))
+    assert strain_reference(near, 99.0) == pytest.approx(start + 0.002, abs=1e-12)
+    assert near.start - 2.0 == pytest.approx(2.0 * 0.002 / speed)
+    at_once = braked(before, 2.0, 0.1, (0.0, start))
+    assert (at_once.start, strain_reference(at_once, 99.0)) == (2.0, start)
+
+
 def test_the_way_to_a_new_trajectory_is_no_longer_than_it_must_be():
     """From rest to rest at least 15/8 of the mean rate is needed (Flash and Hogan)."""
     law = after(still(0.0), 3.0, still(0.1), 0.05, 1e6)
-    assert 3.0 + 1.875 * 0.1 / 0.05 <= law.start <= 3.0 + 1.1 * 1.875 * 0.1 / 0.05
+    assert law.start == pytest.approx(3.0 + 1.875 * 0.1 / 0.05)
     peak = minimize_scalar(lambda t: -rate_of(law, t), bounds=(3.0, law.start), method='bounded')
-    assert 0.05 / 1.1 <= -peak.fun <= 0.05
+    assert -peak.fun == pytest.approx(0.05)
+    law = after(still(0.0), 3.0, still(0.1), 10.0, 0.5)
+    _, strain = curve(law, 3.0, law.start, 1e-4)
+    assert np.diff(strain, 2).max() / 1e-8 == pytest.approx(0.5, rel=1e-4)
 
 
 @given(moments, st.floats(-0.02, 0.15), positive)

@@ -42,4 +42,6 @@ def _declare(node: Node, name: str, declaration: Declaration) -> Any:
         dynamic_typing=True,
     )
     value = node.declare_parameter(name, descriptor=descriptor).value
+    if value is None and name in node._parameter_overrides:  # what rcl makes of an empty list
+        raise ConfigurationError(f'{name} = []: must hold at least one value')
     return list(value) if hasattr(value, 'tolist') else value
