@@ -88,8 +88,9 @@ class Declaration:
                 raise refused
             return value
         try:
-            # YAML 1.1 reads 4.9e7 as text, so text that is a number counts as one.
-            number = math.nan if isinstance(value, bool) else float(value)
+            # YAML 1.1 reads 4.9e7 as text, so text that is a number counts as one. To float()
+            # 1_0 is ten; in a file it is rather a mistake.
+            number = math.nan if isinstance(value, bool) or '_' in str(value) else float(value)
         except (TypeError, ValueError, OverflowError):
             raise refused from None
         below = number <= self.minimum if self.exclusive else number < self.minimum

@@ -62,6 +62,7 @@ def test_what_spreadsheets_write_is_read(tmp_path):
         (HEAD + '0,0\n1,0,0\n', 'row 3: 3 values; must be 2, time and strain'),
         (HEAD + '0,0\n\n1,much\n', 'row 4: strain = much: must be >= -0.1 and <= 0.3'),
         (HEAD + '0,0\n1,\n', 'row 3: strain = : must be >= -0.1 and <= 0.3'),
+        (HEAD + '0,0\n1_0,0\n', 'row 3: time = 1_0 s: must be >= 0 and <= 1e+06'),
         (HEAD + '0,0\n1,nan\n', 'row 3: strain = nan: must be >= -0.1 and <= 0.3'),
         (HEAD + '0,0\n1,5\n', 'row 3: strain = 5: must be >= -0.1 and <= 0.3'),
         (HEAD + '0,0\n-1,0\n', 'row 3: time = -1 s: must be >= 0 and <= 1e+06'),
