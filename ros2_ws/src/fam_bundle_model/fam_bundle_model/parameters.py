@@ -36,6 +36,7 @@ SCHEMES = (*PAPER_SCHEMES, 'all')  # the last keeps all units recruited: a rival
 ALLOCATIONS = ('batch', 'force', 'orderly')
 CYCLIC = ('sine', 'trapezoid', 'steps', 'minimum_jerk')  # and some sums of sines
 KINDS = (*CYCLIC, 'sum_of_sines', 'chirp', 'ramp', 'random', 'samples', 'topic')
+LEAST_PART = 1e-6  # s between two samples; its fifth power is divided by
 MOST_SAMPLES = 10_000  # they stand in the parameter file of every run
 PREDICTORS = ('constant_rate', 'constant_acceleration', 'sinusoid', 'preview')
 GRAVITY = 9.80665  # m/s^2
@@ -278,11 +279,19 @@ class ReferenceParameters:
         minimum=0.0,
         maximum=1.0,
     )
-    strain_rate: float = positive(
-        '1/s', 'largest rate of steps, of a live topic and on the way to a goal', default=0.1
+    strain_rate: float = number(
+        '1/s',
+        'largest rate of steps, of a live topic and on the way to a goal',
+        default=0.1,
+        minimum=1e-4,
+        maximum=10.0,
     )
-    strain_acceleration: float = positive(
-        '1/s^2', 'largest acceleration of steps and on the way to a goal', default=1.0
+    strain_acceleration: float = number(
+        '1/s^2',
+        'largest acceleration of steps and on the way to a goal',
+        default=1.0,
+        minimum=1e-3,
+        maximum=1e3,
     )
     seed: int = integer('seed of the random waypoints', 0, 2**31 - 1, default=0)
     times: tuple[float, ...] = series(
@@ -515,6 +524,11 @@ def check_samples(reference: ReferenceParameters) -> None:
         if time <= before:
             raise ConfigurationError(
                 f'reference.times[{i}] = {time:g} s: must be > {before:g} s, the one before'
+            )
+        if time - before < LEAST_PART:
+            raise ConfigurationError(
+                f'reference.times[{i}] = {time:g} s: must be >= {LEAST_PART:g} s after '
+                f'{before:g} s, the one before'
             )
 
 
