@@ -10,7 +10,7 @@ import pytest
 from fam_bundle_bringup.graph import run_graph
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.trace import PER_UNIT, SCALARS, Trace
-from fam_bundle_model.parameters import PAPER_SCHEMES, Configuration
+from fam_bundle_model.parameters import SCHEMES, Configuration
 
 
 def assert_same_bits(one: Trace, other: Trace) -> None:
@@ -20,7 +20,7 @@ def assert_same_bits(one: Trace, other: Trace) -> None:
         assert one[name].tobytes() == other[name].tobytes(), name
 
 
-@pytest.mark.parametrize('scheme', PAPER_SCHEMES)
+@pytest.mark.parametrize('scheme', SCHEMES)
 def test_graph_equals_one_process(
     scheme: str, quick: Callable[..., Configuration], tmp_path: Path
 ) -> None:

@@ -3,6 +3,7 @@
 
 import itertools
 import re
+import runpy
 from collections.abc import Callable
 from pathlib import Path
 
@@ -302,3 +303,27 @@ def test_every_study_that_is_shipped_can_be_run(path: Path) -> None:
     found = cases_of(read_study(path))
     assert found
     assert not [case.reason for case in found if case.setting is None]
+
+
+def test_table_of_chatter_counts_cases_by_allocation_and_noise(tmp_path: Path) -> None:
+    import pandas as pd
+
+    columns = ['recruitment.scheme', 'allocation.policy', 'sensors.strain_noise']
+    cases = [
+        ('lag', 'force', 1e-4, 5, 'ok'),
+        ('lag', 'force', 1e-4, 0, 'ok'),
+        ('lag', 'force', 1e-4, 1, 'ok'),
+        ('lag', 'batch', 0.0, 0, 'ok'),
+        ('lag', 'batch', 0.0, None, 'diverged'),
+        ('baseline', 'batch', 0.0, 2, 'ok'),
+    ]
+    rows = pd.DataFrame(cases, columns=[*columns, 'needless_shifts', 'status'])
+    (tmp_path / 'chatter').mkdir()
+    rows.to_parquet(tmp_path / 'chatter' / 'study.parquet')
+    tables = runpy.run_path(str(ROOT / 'studies' / 'tables.py'))
+    assert tables['chatter'](tmp_path).splitlines() == [
+        '| scheme | batch, noise 0 | force, noise 0.0001 |',
+        '| --- | --- | --- |',
+        '| lag | 0 of 1 | 2 of 3 |',
+        '| baseline | 1 of 1 | - |',
+    ]
