@@ -74,6 +74,10 @@ def test_written_parameters_give_the_same_run_again(fam: Fam, tmp_path: Path) ->
         (('--reference', 'square'), ('reference.kind', 'square', 'sine')),
         (('--config', '/does/not/exist.yaml'), ('/does/not/exist.yaml', 'No such file')),
         (('--bogus',), ('--bogus',)),
+        (
+            ('--scheme', 'baseline', '--allocation', 'orderly'),
+            ('allocation.policy', 'orderly', 'recruitment.scheme = baseline', 'lag'),
+        ),
         (('--cycles', '100000'), ('reference.cycles', '100000', '<= 2000')),
     ],
 )

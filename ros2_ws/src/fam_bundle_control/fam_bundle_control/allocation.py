@@ -16,6 +16,7 @@ from fam_bundle_model.parameters import ALLOCATIONS
 from fam_bundle_model.pressure_pi import clamp
 
 BATCH, FORCE, ORDERLY = range(len(ALLOCATIONS))
+READY = 0.9  # of its pressure to be: a unit that fills is counted as measured up to there
 
 
 @compiled
@@ -70,6 +71,32 @@ def measured_force(
 
 
 @compiled
+def balance(
+    units: tuple[MotorUnit, ...],
+    older: int,
+    ready: float,
+    force: float,
+    strain: float,
+    mu_pressure: npt.NDArray[np.float64],
+) -> float:
+    """Return the pressure in Pa at which those of the ``older`` units that are full hold ``force``.
+
+    Those that still fill, below ``ready`` (Pa) or slack, give what they are measured to give. The
+    first is full.
+    """
+    passive = stiffness = filling = 0.0
+    for i in range(older):
+        unit, pressure = units[i], max(mu_pressure[i], 0.0)
+        slack = pressure <= fam.deslack_pressure(unit.fam, strain)
+        if i > 0 and (slack or pressure < ready):
+            filling += unit.fams * fam.force(unit.fam, pressure, strain)
+        else:
+            passive += unit.fams * fam.bladder_force(unit.fam, strain)
+            stiffness += unit.fams * fam.mesh_coefficient(unit.fam, strain)
+    return (force - filling - passive) / stiffness if stiffness > 0.0 else 0.0
+
+
+@compiled
 def allocate(
     policy: int,
     units: tuple[MotorUnit, ...],
@@ -88,14 +115,14 @@ def allocate(
     (equation 11) on top, none above the source pressure.
 
     ``force``: one pressure for all recruited units at which the bundle, with the vented units as
-    measured, has the force demanded. While the newest fills or a released one drains, the units
-    before it make up for what it does not give yet, or still gives.
+    measured, has the force demanded. While units fill or a released one drains, those that are
+    full make up for what these do not give yet, or still give.
 
     ``orderly``: the units before the newest carry what they can, up to the full source pressure;
     the newest carries the rest and is never let go slack.
 
-    Both are limited to the nominal pressure, not to the drooped source: a reference above what
-    the source has opens the valve fully.
+    Both are limited to the nominal pressure, or to a source above it, not to a drooped source: a
+    reference above what the source has opens the valve fully.
     """
     count = len(units)
     references[:] = 0.0
@@ -107,17 +134,20 @@ def allocate(
     newest, older = recruited - 1, max(recruited - 1, 1)
     vented = measured_force(units, recruited, count, mu_pressure, strain)
     share = taut_force(units, pressure_reference, strain) - vented
+    given = measured_force(units, older, recruited, mu_pressure, strain)
     if policy == FORCE:
-        given = measured_force(units, older, recruited, mu_pressure, strain)
-        before = common_pressure(units, 0, older, share - given, strain)
         last = common_pressure(units, 0, recruited, share, strain)
+        ready = READY * last
+        before = balance(units, older, ready, share - given, strain, mu_pressure)
     else:
         # What a slack unit resists is made up for; what a taut one gives is its own rest.
-        given = min(measured_force(units, older, recruited, mu_pressure, strain), 0.0)
-        before = common_pressure(units, 0, older, share - given, strain)
+        ready = 0.0
+        before = balance(units, older, ready, share - min(given, 0.0), strain, mu_pressure)
         carried = measured_force(units, 0, newest, mu_pressure, strain)
         last = common_pressure(units, newest, recruited, share - carried, strain)
         last = max(last, fam.deslack_pressure(units[newest].fam, strain))
+    highest = max(source_pressure, nominal_pressure)
     for i in range(recruited):
-        wanted = before if i < older else last
-        references[i] = clamp(wanted, 0.0, max(source_pressure, nominal_pressure))
+        fills = policy == FORCE and i > 0 and mu_pressure[i] < ready
+        wanted = last if i >= older or fills else before
+        references[i] = clamp(wanted, 0.0, highest)

@@ -43,8 +43,9 @@ SATURATED = 0.97  # of the source pressure: a unit there has no more to give
 class Recruitment(NamedTuple):
     """Settings of the recruitment law; pressures in Pa, times in s.
 
-    ``hold_all`` keeps every unit recruited. ``own_flow`` says that a prediction reckons with what
-    the recruited units' own flow loses on its way from the source.
+    ``hold_all`` keeps every unit recruited. ``by_force`` is our allocation: predictions then
+    reckon with what the recruited units' own flow loses on its way from the source, and a release
+    has to be called for during a whole lag.
     """
 
     predictor: Predictor
@@ -56,15 +57,14 @@ class Recruitment(NamedTuple):
     minimum_dwell: float
     hold_all: bool
     reserve: float
-    return_rate: float
-    own_flow: bool
+    by_force: bool
     supply: HydraulicLaw
 
 
 class RecruitmentState(NamedTuple):
     """What the law remembers: units recruited, filters, time in the state, downshift armed.
 
-    ``failed`` is the strain at which the state below was seen at its end, infinite if it was not.
+    ``below`` is for how long, in s, a release has been called for.
     """
 
     recruited: int
@@ -72,7 +72,6 @@ class RecruitmentState(NamedTuple):
     force: float
     dwell: float
     armed: bool
-    failed: float
     below: float
     started: bool
 
@@ -105,8 +104,7 @@ def recruitment(configuration: Configuration, *, live: bool | None = None) -> Re
         minimum_dwell=p.minimum_dwell,
         hold_all=p.scheme == 'all',
         reserve=p.reserve,
-        return_rate=p.return_rate,
-        own_flow=configuration.allocation.policy != ALLOCATIONS[BATCH],
+        by_force=configuration.allocation.policy != ALLOCATIONS[BATCH],
         supply=hydraulic_law(configuration),
     )
 
@@ -116,7 +114,7 @@ def recruitment_start() -> RecruitmentState:
 
     Each run needs its own: the law writes in the predictor's forecasts.
     """
-    return RecruitmentState(1, predictor_start(), 0.0, math.inf, False, math.inf, 0.0, False)
+    return RecruitmentState(1, predictor_start(), 0.0, math.inf, False, 0.0, False)
 
 
 @compiled
@@ -170,7 +168,7 @@ def saturated(
     recruited: int, mu_pressure: npt.NDArray[np.float64], source_pressure: float
 ) -> bool:
     """Return whether every recruited unit is at the source pressure already, if there is any."""
-    for i in range(recruited):  # noqa: SIM110  numba has no all()
+    for i in range(recruited):
         if mu_pressure[i] < SATURATED * source_pressure:
             return False
     return source_pressure > 0.0
@@ -195,7 +193,7 @@ def attainable_pressure(
     of oil into each FAM (equations 1 and 8: virtual work).
     """
     loss = 0.0
-    if law.own_flow:
+    if law.by_force:
         for i in range(recruited):
             unit = units[i]
             area = unit.fams * unit.fam.length * fam.mesh_coefficient(unit.fam, strain)
@@ -256,7 +254,7 @@ def recruitment_step(
     at_end = at_end and source_pressure >= table.source_pressure[0]
     if at_end:
         saturation, lasts = 0.0, lag.lag < math.inf
-    release, reached = lag, -math.inf
+    release = lag
     if recruited > 1 and may_fall(law.predictor, expected):
         newest_deslack = fam.deslack_pressure(units[newest].fam, strain)
         release = look_up(table, newest, source_pressure, newest_deslack)
@@ -264,9 +262,6 @@ def recruitment_step(
         effective = attainable_pressure(law, units, recruited - 1, *given)
         limit = modelled_strain(units, recruited - 1, effective, load)
         desaturation = time_to_fall(law.predictor, expected, reference, limit)
-        # However slow the fall, the strain may come back faster; and what the model says the
-        # lower state can hold is not believed where it was seen to fail.
-        reached = min(limit, state.failed) - law.return_rate * release.lag
         # The unit could not be recruited again before the dwell is over, nor be taut a lag later.
         again = release.lag + law.minimum_dwell
         comes_back = time_to_rise(law.predictor, expected, reference, limit) <= again
@@ -275,24 +270,23 @@ def recruitment_step(
     if law.lag_compensation:
         armed = armed or mu_pressure[newest] >= fam.deslack_pressure(units[newest].fam, strain)
         up = saturation <= lag.lag and lasts
-        down = desaturation <= -release.lag and strain <= reached and not comes_back
+        down = desaturation <= -release.lag and not comes_back
         below = state.below + dt if down else 0.0
-        down = down and (not law.own_flow or below > release.lag)
+        # A noisy strain rate calls for a release now and then; not for a whole lag.
+        down = down and (not law.by_force or below > release.lag)
     else:
         armed = armed or mu_pressure[newest] > law.downshift_pressure
         up = recruited < len(units) and mu_pressure[0] >= law.upshift_pressure
         down = mu_pressure[newest] <= law.downshift_pressure
-    dwell, failed = state.dwell + dt, state.failed
+    dwell = state.dwell + dt
     # A shift disturbs the very strain rate that the next decision rests on.
     if law.hold_all:
         dwell = 0.0
     elif up and dwell >= law.minimum_dwell:
         recruited, dwell, armed = recruited + 1, 0.0, False
-        failed = strain if at_end else math.inf
     elif recruited > 1 and down and armed and dwell >= law.minimum_dwell:
         # Below the top state the newest unit has been taut already.
         recruited, dwell, armed = recruited - 1, 0.0, True
-        failed = math.inf
     output = RecruitmentOutput(
         recruited,
         expected.strain_rate,
@@ -305,4 +299,4 @@ def recruitment_step(
         lag.outside,
         expected.error,
     )
-    return RecruitmentState(recruited, expected, load, dwell, armed, failed, below, True), output
+    return RecruitmentState(recruited, expected, load, dwell, armed, below, True), output

@@ -96,6 +96,24 @@ def test_by_force_the_first_units_make_up_for_the_one_that_fills(bundle, strain,
     assert asked[1] == pytest.approx(end[1])
 
 
+@pytest.mark.parametrize(('second', 'third'), [(2e4, 0.0), (1.5e5, 2e4), (2.2e5, 1e5)])
+@POLICIES
+def test_a_shift_may_begin_while_another_completes(bundle, policy, second, third):
+    """Two units fill at once: the first one makes up for both."""
+    strain, demand, source = 0.06, 1.9e5, 6.895e5
+    pressures = (3e5, second, third)
+    asked = references(policy, bundle, 3, demand, strain, pressures, source)
+    assert asked[0] < source, 'what follows is no matter of the limit'
+    given = bundle_force(bundle, np.array([asked[0], second, third]), strain)
+    wanted = taut_force(bundle, demand, strain)
+    full = 0.9 * demand if policy == FORCE else fam.deslack_pressure(bundle[1].fam, strain)
+    if second < full:
+        assert given == pytest.approx(wanted, abs=1e-6)
+    if policy == FORCE:
+        assert asked[2] == pytest.approx(demand)
+        assert asked[1] == (asked[2] if second < full else asked[0])
+
+
 def test_by_force_recruited_units_end_at_one_pressure(bundle):
     asked = settled(FORCE, bundle, 3, 3e5, 0.06, (0.0, 0.0, 0.0))
     assert asked == pytest.approx([3e5] * 3)

@@ -216,3 +216,31 @@ def test_units_that_have_no_more_to_give_get_help_even_if_nothing_moves(
     assert supervisor.step(strain=0.0, pressures=(6.4e5, 0.0)).recruited == 2
     hopeless = supervise(law('lag'), constant_table(math.inf))
     assert hopeless.step(400, strain=0.0, pressures=(6.4e5, 0.0)).recruited == 1
+
+
+@pytest.mark.parametrize('source', [0.0, 200.0, 1e5])
+def test_a_source_that_is_off_recruits_nothing(supervise, law, constant_table, source):
+    """A unit at the pressure of such a source is not at its end: no state would help."""
+    table = constant_table(0.2)
+    table = table._replace(source_pressure=np.linspace(2e5, 7e5, 2))
+    supervisor = supervise(law('lag'), table)
+    assert supervisor.step(400, strain=0.0, source=source, pressures=(source, 0.0)).recruited == 1
+
+
+def test_by_force_a_release_is_called_for_during_a_whole_lag(supervise, law, constant_table):
+    """A noisy strain rate calls for it now and then; then the time begins anew."""
+    for by_force in (False, True):
+        supervisor = supervise(law('lag', by_force=by_force), constant_table(0.2))
+        supervisor.step(400, strain=0.14, pressures=(5e5, 6e5))
+        supervisor.state = supervisor.state._replace(recruited=2, armed=True, dwell=9.0)
+        called = released = 0
+        for tick in range(4000):
+            output = supervisor.move(-RATE, 1)
+            if not called and output.time_to_desaturation <= -0.2:
+                called = tick
+            if output.recruited == 1:
+                released = tick
+                break
+        assert called
+        expected = 0.2 if by_force else 0.0
+        assert (released - called) * DT == pytest.approx(expected, abs=2 * DT)

@@ -42,7 +42,7 @@ def evaluate():
     axis = np.linspace(0.0, 7e5, 6)
     table = LagTable(axis, axis, random.random((2, 6, 6)), 1e5 * random.random((2, 6, 6)))
     found = {}
-    schemes = ('baseline', 'lag_pressure', 'lag')
+    schemes = ('lag_pressure', 'baseline', 'lag')
     predictors = ('constant_rate', 'sinusoid', 'constant_acceleration')
     for scheme, allocation, expected in zip(schemes, ALLOCATIONS, predictors, strict=True):
         chosen = dataclasses.replace(configuration.recruitment, scheme=scheme, predictor=expected)

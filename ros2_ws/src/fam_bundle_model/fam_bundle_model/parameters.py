@@ -462,9 +462,24 @@ def make_configuration(
         check_recruitment(configuration.recruitment)
     if configuration.reference is not None:
         check_reference(configuration.reference)
+    if configuration.recruitment is not None and configuration.allocation is not None:
+        check_allocation(configuration.recruitment, configuration.allocation)
     if configuration.run is not None and configuration.simulation is not None:
         check_run(configuration.run, configuration.simulation)
     return configuration
+
+
+def check_allocation(recruitment: RecruitmentParameters, allocation: AllocationParameters) -> None:
+    """Raise ConfigurationError where the thresholds would see what the allocation does itself.
+
+    Orderly, the older units are saturated and the newest may be near its de-slack pressure: each
+    pressure would call for the opposite shift.
+    """
+    if allocation.policy == 'orderly' and recruitment.scheme in ('baseline', 'pressure'):
+        raise ConfigurationError(
+            f'allocation.policy = orderly: recruitment.scheme = {recruitment.scheme} shifts at '
+            'thresholds of pressure; must be lag, lag_pressure or all'
+        )
 
 
 def check_run(run: RunParameters, simulation: SimulationParameters) -> None:
