@@ -79,7 +79,7 @@ def balance(
     strain: float,
     mu_pressure: npt.NDArray[np.float64],
 ) -> float:
-    """Return the pressure in Pa at which those of the ``older`` units that are full hold ``force``.
+    """Return the pressure in Pa at which the full ones of the ``older`` units hold ``force`` N.
 
     Those that still fill, below ``ready`` (Pa) or slack, give what they are measured to give. The
     first is full.
