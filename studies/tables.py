@@ -27,6 +27,31 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return '\n'.join(lines)
 
 
+COLOURS = '#D55E00, #0072B2, #009E73, #E69F00, #56B4E9'
+NAMES = ('vermilion', 'blue', 'green', 'orange', 'light blue')
+
+
+def chart(
+    title: str, x: tuple[str, Sequence[str]], unit: str, lines: dict[str, Sequence[float]]
+) -> str:
+    """Return a line chart for Mermaid; it knows no legend, so the title tells the colours."""
+    told = ', '.join(f'{name} ({colour})' for name, colour in zip(lines, NAMES, strict=False))
+    labels = ', '.join(f'"{label}"' for label in x[1])
+    drawn = [f'    line [{", ".join(f"{v:.4g}" for v in values)}]' for values in lines.values()]
+    return '\n'.join(
+        [
+            '```mermaid',
+            '%%{init: {"themeVariables": {"xyChart": {"plotColorPalette": "' + COLOURS + '"}}}}%%',
+            'xychart-beta',
+            f'    title "{title}: {told}"',
+            f'    x-axis "{x[0]}" [{labels}]',
+            f'    y-axis "{unit}"',
+            *drawn,
+            '```',
+        ]
+    )
+
+
 def both(rows: Rows, names: Sequence[str] = SINGLE) -> str:
     """Return medians of two columns as one cell."""
     return ' / '.join(f'{rows[name].median():.4f}' for name in names)
@@ -87,6 +112,16 @@ def grid(folder: Path) -> str:
         for name in SINGLE:
             parts.append(f'{scheme}, {name} over that of the best threshold:')
             parts.append(heat_map(rows, scheme, f'best_threshold.{name}_ratio', *axes))
+    at = rows[rows['reference.amplitude'] == 0.06]
+    lines = {
+        scheme: (100.0 * at[at.scheme == scheme].max_error).tolist()
+        for scheme in ('baseline', 'lag_pressure', 'force')
+    }
+    rival = at[at.scheme == 'baseline']['best_threshold.max_error']
+    lines['best threshold'] = (100.0 * rival).tolist()
+    frequencies = [f'{f:g}' for f in sorted(at['reference.frequency'].unique())]
+    title = 'Maximum error at amplitude 0.06'
+    parts.append(chart(title, ('frequency (Hz)', frequencies), 'error (% strain)', lines))
     base = rows[rows.scheme == 'baseline'].set_index(list(axes))
     for scheme in ('lag', 'lag_pressure'):
         found = rows[rows.scheme == scheme].set_index(list(axes))
@@ -113,7 +148,14 @@ def references(folder: Path) -> str:
             rival += f' at {best["best_threshold.threshold"]:.0%}'
         table.append([str(label), *cells, rival])
     head = ['reference', *schemes, 'best threshold']
-    return '\n\n'.join([markdown(head, table), against_rivals(rows)])
+    lines = {
+        scheme: rows[rows.scheme == scheme]['best_threshold.max_error_ratio'].tolist()
+        for scheme in ('lag_pressure', 'force', 'orderly')
+    }
+    labels = [str(label) for label in rows.reference.unique()]
+    title = 'Maximum error over that of the best threshold'
+    drawn = chart(title, ('reference', labels), 'ratio', lines)
+    return '\n\n'.join([markdown(head, table), against_rivals(rows), drawn])
 
 
 def prediction(folder: Path) -> str:
@@ -139,7 +181,16 @@ def prediction(folder: Path) -> str:
                 before = int((base.loc[here, 'needless_shifts'] > 0).sum())
                 table.append([f'{noise:g}', f'{name}{suffix}', *cells, f'{chatter} ({before})'])
     head = ['noise', 'predictor', 'sines: IAE', 'maximum', 'others: IAE', 'maximum']
-    return markdown([*head, 'cases with needless shifts (constant rate)'], table)
+    clean = rows[rows['sensors.strain_noise'] == 0.0]
+    base = clean[clean.scheme == 'constant rate'].set_index('reference').max_error
+    lines = {
+        name: (clean[clean.scheme == name].set_index('reference').max_error / base).tolist()
+        for name in ('acceleration', 'sinusoid', 'preview')
+    }
+    title = 'lag_pressure, no noise: maximum error over that at constant rate'
+    drawn = chart(title, ('reference', [str(label) for label in base.index]), 'ratio', lines)
+    table_text = markdown([*head, 'cases with needless shifts (constant rate)'], table)
+    return '\n\n'.join([table_text, drawn])
 
 
 def wrong_model(folder: Path) -> str:
@@ -162,6 +213,16 @@ def wrong_model(folder: Path) -> str:
         head = ['scheme', 'median IAE / maximum', '90 %', 'worst']
         head += ['both at most the best threshold', 'cases with needless shifts']
         parts += [f'{label}:', markdown(head, table)]
+        shares = [k / 10.0 for k in range(11)]
+        lines = {
+            scheme: [100.0 * found[found.scheme == scheme].max_error.quantile(q) for q in shares]
+            for scheme in ('baseline', 'lag_pressure', 'force', 'reserve')
+        }
+        rival = found[found.scheme == 'baseline']['best_threshold.max_error']
+        lines['best threshold'] = [100.0 * rival.quantile(q) for q in shares]
+        percent = [f'{q:.0%}' for q in shares]
+        title = f'Maximum error, {label}'
+        parts.append(chart(title, ('share of the rigs', percent), 'error (% strain)', lines))
         force = found[found.scheme == 'force']
         varied = [c for c in rows.columns if c.startswith('rig.')]
         for name in SINGLE:
@@ -186,6 +247,14 @@ def reserve(folder: Path) -> str:
             ]
             table.append([f'{kept / 1e3:g}', *cells])
         parts += [f'{label}:', markdown(['reserve (kPa)', *schemes], table)]
+        kept = [f'{k / 1e3:g}' for k in sorted(found['recruitment.reserve'].unique())]
+        lines = {
+            scheme: (
+                100.0 * found[found.scheme == scheme].sort_values('recruitment.reserve')[name]
+            ).tolist()
+            for scheme, name in (('lag_pressure', 'max_error'), ('force', 'max_error'))
+        }
+        parts.append(chart(f'Maximum error, {label}', ('reserve (kPa)', kept), '% strain', lines))
     return '\n\n'.join(parts)
 
 
@@ -204,6 +273,12 @@ def ladder(folder: Path) -> str:
                 cells.append(f'{tracked}, {row.efficiency:.1%}, {row.upshifts:.0f}')
             table.append([str(bundle), *cells])
         parts += [f'{label}:', markdown(['bundle', *schemes], table)]
+        lines = {
+            scheme: (100.0 * found[found.scheme == scheme].efficiency).tolist()
+            for scheme in ('baseline', 'lag_pressure', 'orderly')
+        }
+        bundles = [str(bundle) for bundle in found.bundle.unique()]
+        parts.append(chart(f'Efficiency, {label}', ('motor units', bundles), '%', lines))
     return '\n\n'.join(parts)
 
 
