@@ -13,7 +13,7 @@ from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.report_files import write_report
 from fam_bundle_io.shapes import paper_claims
 from fam_bundle_io.trace import Trace
-from fam_bundle_model.parameters import PAPER_SCHEMES, Configuration
+from fam_bundle_model.parameters import PAPER_SCHEMES, Configuration, load_configuration
 from fam_bundle_model.schema import ConfigurationError
 
 FIGURES = {
@@ -51,7 +51,7 @@ def test_demo_writes_all_its_results(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(hindsight, 'THRESHOLDS', (0.4, 0.6, 0.7))
-    demo.run_demo(quick(), tmp_path)
+    demo.run_demo(quick(allocation={'policy': 'force'}), tmp_path)
     table = json.loads((tmp_path / 'table2.json').read_text())
     assert set(table) == set(demo.PAPER)
     for scheme in PAPER_SCHEMES:
@@ -61,6 +61,9 @@ def test_demo_writes_all_its_results(
             assert table[scheme] == {k: metrics[k] for k in ('iae', 'max_error')}
     rival = json.loads((tmp_path / 'baseline_hindsight' / 'metrics.json').read_text())
     assert rival['upshift_threshold'] in (0.6, 0.7)
+    for baseline in ('baseline', 'baseline_hindsight'):  # the paper's, whatever is configured
+        parameters = load_configuration(tmp_path / baseline / 'parameters.yaml')
+        assert parameters.allocation.policy == 'batch'
     for name in FIGURES:
         assert (tmp_path / f'{name}.png').read_bytes().startswith(b'\x89PNG')
         assert (tmp_path / f'{name}.pdf').read_bytes().startswith(b'%PDF')
@@ -128,7 +131,6 @@ def test_bench_measures_every_candidate(
 @pytest.fixture(scope='module')
 def traces(request: pytest.FixtureRequest) -> tuple[Configuration, dict[str, Trace]]:
     from fam_bundle_bringup.experiment import default_configuration
-    from fam_bundle_model.parameters import load_configuration
 
     configuration = load_configuration(default_configuration())
     found = {}

@@ -49,9 +49,9 @@ def run_demo(configuration: Configuration, folder: Path) -> None:
     table = {scheme: tracked[scheme]._asdict() for scheme in PAPER}
     write_json(table, folder / 'table2.json')
     with progress_bar('threshold by hindsight, offline', len(THRESHOLDS)) as progress:
-        rival = best_threshold(configuration, progress)
+        rival = best_threshold(with_scheme(configuration, 'baseline'), progress)
     if rival is not None:
-        tuned = with_threshold(configuration, rival.threshold)
+        tuned = with_threshold(with_scheme(configuration, 'baseline'), rival.threshold)
         run_experiment(tuned, 'offline', folder / 'baseline_hindsight')
     beyond = {
         name: run_experiment(one, 'offline', folder / name)
