@@ -206,20 +206,17 @@ def wrong_model(folder: Path) -> str:
                     both(one),
                     ' / '.join(f'{one[n].quantile(0.9):.4f}' for n in SINGLE),
                     ' / '.join(f'{one[n].max():.4f}' for n in SINGLE),
-                    ratios(one, 'best_threshold')[2],
                     f'{(one.needless_shifts > 0).sum()} of {len(one)}',
                 ]
             )
         head = ['scheme', 'median IAE / maximum', '90 %', 'worst']
-        head += ['both at most the best threshold', 'cases with needless shifts']
+        head += ['cases with needless shifts']
         parts += [f'{label}:', markdown(head, table)]
         shares = [k / 10.0 for k in range(11)]
         lines = {
             scheme: [100.0 * found[found.scheme == scheme].max_error.quantile(q) for q in shares]
-            for scheme in ('baseline', 'lag_pressure', 'force', 'reserve')
+            for scheme in ('threshold_54', 'lag_pressure', 'force', 'reserve')
         }
-        rival = found[found.scheme == 'baseline']['best_threshold.max_error']
-        lines['best threshold'] = [100.0 * rival.quantile(q) for q in shares]
         percent = [f'{q:.0%}' for q in shares]
         title = f'Maximum error, {label}'
         parts.append(chart(title, ('share of the rigs', percent), 'error (% strain)', lines))

@@ -13,7 +13,7 @@ from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.metrics import Tracking, needless_shifts
 from fam_bundle_model.lag_table import cached_lag_table
-from fam_bundle_model.parameters import Configuration
+from fam_bundle_model.parameters import Configuration, check_allocation
 
 THRESHOLDS = tuple(np.round(np.arange(0.40, 0.951, 0.01), 2).tolist())
 
@@ -27,10 +27,14 @@ class Rival(NamedTuple):
 
 
 def with_threshold(configuration: Configuration, threshold: float) -> Configuration:
-    """Return the baseline of ``configuration`` with another upshift threshold."""
+    """Return the baseline of ``configuration`` with another upshift threshold.
+
+    Raises ConfigurationError where its allocation does not go with thresholds.
+    """
     recruitment = dataclasses.replace(
         configuration.recruitment, scheme='baseline', upshift_threshold=threshold
     )
+    check_allocation(recruitment, configuration.allocation)
     return dataclasses.replace(configuration, recruitment=recruitment)
 
 
