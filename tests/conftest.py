@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shared pieces of the tests of the whole system."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -29,14 +30,53 @@ def quick() -> Callable[..., Configuration]:
 
 
 @pytest.fixture(scope='session')
-def recorded_runs(
+def recorded_run(
     tmp_path_factory: pytest.TempPathFactory, quick: Callable[..., Configuration]
-) -> Path:
-    """Return a folder with two experiments through the graph, each with its bag."""
+) -> Callable[[str], Path]:
+    """Return what gives the folder of a quick experiment through the graph, run once a scheme.
+
+    A bag is with it.
+    """
     folder = tmp_path_factory.mktemp('runs')
-    for scheme in ('baseline', 'lag_pressure'):
+
+    @functools.cache
+    def run(scheme: str) -> Path:
         run_experiment(quick(scheme), 'lockstep', folder / scheme, record=True)
+        return folder / scheme
+
+    return run
+
+
+@pytest.fixture(scope='session')
+def recorded_runs(recorded_run: Callable[[str], Path]) -> Path:
+    """Return a folder with two of these experiments."""
+    (folder,) = {recorded_run(scheme).parent for scheme in ('baseline', 'lag_pressure')}
     return folder
+
+
+@pytest.fixture(scope='session')
+def three_units(
+    tmp_path_factory: pytest.TempPathFactory, quick: Callable[..., Configuration]
+) -> tuple[Configuration, Path]:
+    """Return a run of three unequal units with noise, and its folder; a bag is with it."""
+    configuration = quick(
+        fam={'count': [1, 1, 2]},
+        recruitment={'scheme': 'lag_pressure', 'predictor': 'sinusoid'},
+        allocation={'policy': 'orderly'},
+        pressure_loop={
+            'proportional_gain': [3e-6, 3.5e-6, 7e-6],
+            'integral_limit': [0.1, 0.2, 0.3],
+        },
+        sensors={
+            'strain_noise': 1e-5,
+            'force_noise': 0.5,
+            'pressure_noise': 200.0,
+            'strain_resolution': 1e-6,
+        },
+    )
+    folder = tmp_path_factory.mktemp('three_units')
+    run_experiment(configuration, 'lockstep', folder, record=True)
+    return configuration, folder
 
 
 @pytest.fixture

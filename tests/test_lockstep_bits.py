@@ -9,7 +9,7 @@ import pytest
 
 from fam_bundle_bringup.graph import run_graph
 from fam_bundle_bringup.offline import run_offline
-from fam_bundle_io.trace import PER_UNIT, SCALARS, Trace
+from fam_bundle_io.trace import PER_UNIT, SCALARS, Trace, load_trace
 from fam_bundle_model.parameters import SCHEMES, Configuration
 
 
@@ -22,10 +22,10 @@ def assert_same_bits(one: Trace, other: Trace) -> None:
 
 @pytest.mark.parametrize('scheme', SCHEMES)
 def test_graph_equals_one_process(
-    scheme: str, quick: Callable[..., Configuration], tmp_path: Path
+    scheme: str, quick: Callable[..., Configuration], recorded_run: Callable[[str], Path]
 ) -> None:
     configuration = quick(scheme)
-    trace = run_graph(configuration, tmp_path)
+    trace = load_trace(recorded_run(scheme) / 'trace.npz')
     assert len(trace['time']) == configuration.ticks() == 4000
     assert trace['recruitment_state'].max() == 2, 'the run must contain a shift'
     assert_same_bits(trace, run_offline(configuration))
@@ -37,24 +37,16 @@ def test_graph_equals_one_process_while_all_cores_are_busy(
     configuration = quick(
         recruitment={'scheme': 'lag_pressure', 'predictor': 'preview'},
         allocation={'policy': 'force'},
+        reference={'amplitude': 0.06, 'frequency': 0.5, 'cycles': 1},
     )
     assert_same_bits(run_graph(configuration, tmp_path), run_offline(configuration))
 
 
 def test_graph_equals_one_process_with_sensor_noise_and_three_units(
-    quick: Callable[..., Configuration], tmp_path: Path
+    three_units: tuple[Configuration, Path],
 ) -> None:
-    configuration = quick(
-        fam={'count': [1, 1, 2]},
-        recruitment={'scheme': 'lag_pressure', 'predictor': 'sinusoid'},
-        allocation={'policy': 'orderly'},
-        pressure_loop={
-            'proportional_gain': [3e-6, 3.5e-6, 7e-6],
-            'integral_limit': [0.1, 0.2, 0.3],
-        },
-        sensors={'strain_noise': 1e-5, 'pressure_noise': 200.0, 'strain_resolution': 1e-6},
-    )
-    trace = run_graph(configuration, tmp_path)
+    configuration, folder = three_units
+    trace = load_trace(folder / 'trace.npz')
     assert trace['mu_pressure'].shape == (4000, 3)
     assert np.unique(trace['recruitment_state']).size > 1, 'the run must contain a shift'
     assert_same_bits(trace, run_offline(configuration))

@@ -64,7 +64,10 @@ def test_the_default_executor_gives_the_same_bits(
 def test_two_bundles_do_not_disturb_each_other_by_a_bit(
     quick: Callable[..., Configuration], tmp_path: Path
 ) -> None:
-    configurations = {'left': quick('lag_pressure'), 'right': quick('baseline')}
+    configurations = {
+        'left': quick('lag_pressure', reference=SHORT),
+        'right': quick('baseline', reference=SHORT),
+    }
     with own_domain(), recording(tuple(configurations)) as (recorders, listen):
         with nodes_in(tmp_path) as group:
             owners = []
@@ -109,61 +112,6 @@ def test_every_period_is_a_sample_or_counted_as_skipped(
         'pressure_controller',
         'plant_simulator',
     }
-
-
-@pytest.fixture
-def rig(quick: Callable[..., Configuration], tmp_path: Path) -> Iterator[Rig]:
-    """Return a running loop in real time that no test's machine is too slow for."""
-    configuration = quick(
-        reference={'amplitude': 0.06, 'frequency': 0.1, 'cycles': 1000},
-        run={'pace': 'realtime', 'command_timeout': 0.5},
-    )
-    with Rig(configuration, tmp_path) as running:
-        running.start_all()
-        yield running
-
-
-def test_nothing_leaves_the_machine_or_shares_its_memory(rig: Rig) -> None:
-    for name, process in rig.nodes.items():
-        links = [os.readlink(f) for f in Path(f'/proc/{process.pid}/fd').iterdir()]
-        sockets = {link[8:-1] for link in links if link.startswith('socket:[')}
-        rows = Path(f'/proc/{process.pid}/net/udp').read_text().splitlines()[1:]
-        addresses = {row.split()[1].partition(':')[0] for row in rows if row.split()[9] in sockets}
-        assert addresses == {f'{int.from_bytes(bytes([127, 0, 0, 1]), sys.byteorder):08X}'}, name
-        assert not shares_memory(process.pid)
-
-
-@pytest.mark.parametrize('victim', ['strain_controller', 'recruitment_supervisor'])
-def test_a_killed_controller_makes_the_plant_safe_and_rejoins(victim: str, rig: Rig) -> None:
-    since = rig.signal(victim, signal.SIGKILL)
-    rig.wait_for(lambda: rig.safe_after(since) is not None, 'the safe state')
-    rig.wait_for(lambda: bool(rig.reason(since, 'waiting for')), 'the reason')
-    rig.start(victim)
-    rig.wait_for(rig.runs, 'the run to go on')
-    joined = rig.first_tick_of_this_stretch()
-    assert first_bump(rig, joined) < 0.02 * rig.configuration.source.nominal_pressure
-
-
-def test_a_new_plant_runs_with_the_controllers_of_the_last(rig: Rig) -> None:
-    rig.signal('plant_simulator', signal.SIGKILL)
-    rig.start('plant_simulator')
-    rig.wait_for(lambda: rig.seen['bundle_state'][-1].message.tick < 100, 'the new run')
-    rig.wait_for(rig.runs, 'the new run to run')
-
-
-def test_bad_commands_latch_a_fault_until_it_is_reset(rig: Rig) -> None:
-    from std_srvs.srv import Trigger
-
-    since = inject(rig, 'valve_command', not_finite, 30)
-    rig.wait_for(lambda: rig.safe_after(since) is not None, 'the safe state')
-    rig.wait_for(lambda: bool(rig.reason(since, 'fault: valve_command')), 'the reason')
-    client = rig.node.create_client(Trigger, 'plant_simulator/reset_fault')
-    rig.wait_for(client.service_is_ready, 'the service')
-    for expected in (True, False):
-        answer = client.call_async(Trigger.Request())
-        rig.wait_for(answer.done, 'the answer')
-        assert answer.result().success is expected
-    rig.wait_for(rig.runs, 'the run to go on')
 
 
 # ---- What a user may ask for ----
@@ -214,3 +162,66 @@ def test_a_time_out_below_two_periods_is_refused(quick: Callable[..., Configurat
     with pytest.raises(ConfigurationError, match=r'run\.command_timeout = 0\.0015 s: must be >='):
         quick(run={'command_timeout': 0.0015})
     assert dataclasses.replace(quick().run, command_timeout=0.002)
+
+
+# ---- Hurt on a clock ----
+
+
+@pytest.fixture(scope='module')
+def rig(
+    quick: Callable[..., Configuration], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Rig]:
+    """Return a running loop in real time that no test's machine is too slow for.
+
+    One for all tests here, each of which leaves it running.
+    """
+    configuration = quick(
+        reference={'amplitude': 0.06, 'frequency': 0.02, 'cycles': 1000},
+        run={'pace': 'realtime', 'command_timeout': 0.5},
+    )
+    with Rig(configuration, tmp_path_factory.mktemp('rig')) as running:
+        running.start_all()
+        yield running
+
+
+def test_nothing_leaves_the_machine_or_shares_its_memory(rig: Rig) -> None:
+    for name, process in rig.nodes.items():
+        links = [os.readlink(f) for f in Path(f'/proc/{process.pid}/fd').iterdir()]
+        sockets = {link[8:-1] for link in links if link.startswith('socket:[')}
+        rows = Path(f'/proc/{process.pid}/net/udp').read_text().splitlines()[1:]
+        addresses = {row.split()[1].partition(':')[0] for row in rows if row.split()[9] in sockets}
+        assert addresses == {f'{int.from_bytes(bytes([127, 0, 0, 1]), sys.byteorder):08X}'}, name
+        assert not shares_memory(process.pid)
+
+
+@pytest.mark.parametrize('victim', ['strain_controller', 'recruitment_supervisor'])
+def test_a_killed_controller_makes_the_plant_safe_and_rejoins(victim: str, rig: Rig) -> None:
+    since = rig.signal(victim, signal.SIGKILL)
+    rig.wait_for(lambda: rig.safe_after(since) is not None, 'the safe state')
+    rig.wait_for(lambda: bool(rig.reason(since, 'waiting for')), 'the reason')
+    rig.start(victim)
+    rig.wait_for(rig.runs, 'the run to go on')
+    joined = rig.first_tick_of_this_stretch()
+    assert first_bump(rig, joined) < 0.02 * rig.configuration.source.nominal_pressure
+
+
+def test_a_new_plant_runs_with_the_controllers_of_the_last(rig: Rig) -> None:
+    rig.signal('plant_simulator', signal.SIGKILL)
+    rig.start('plant_simulator')
+    rig.wait_for(lambda: rig.seen['bundle_state'][-1].message.tick < 100, 'the new run')
+    rig.wait_for(rig.runs, 'the new run to run')
+
+
+def test_bad_commands_latch_a_fault_until_it_is_reset(rig: Rig) -> None:
+    from std_srvs.srv import Trigger
+
+    since = inject(rig, 'valve_command', not_finite, 30)
+    rig.wait_for(lambda: rig.safe_after(since) is not None, 'the safe state')
+    rig.wait_for(lambda: bool(rig.reason(since, 'fault: valve_command')), 'the reason')
+    client = rig.node.create_client(Trigger, 'plant_simulator/reset_fault')
+    rig.wait_for(client.service_is_ready, 'the service')
+    for expected in (True, False):
+        answer = client.call_async(Trigger.Request())
+        rig.wait_for(answer.done, 'the answer')
+        assert answer.result().success is expected
+    rig.wait_for(rig.runs, 'the run to go on')

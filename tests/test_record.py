@@ -19,22 +19,23 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import UInt64
 
 from fam_bundle_bringup.cli import recorded_lines
-from fam_bundle_bringup.graph import own_domain, run_graph
+from fam_bundle_bringup.graph import own_domain
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_bringup.processes import executable
 from fam_bundle_io.bag import read_bag, trace_of
 from fam_bundle_io.bag_recorder_node import BagRecorder
+from fam_bundle_io.trace import load_trace
 from fam_bundle_model.parameters import Configuration
 
 LOOP = ('/bundle_state', '/pressure_reference', '/recruitment_state', '/valve_command')
 
 
 def test_a_recorded_run_gives_its_trace_to_the_last_bit(
-    quick: Callable[..., Configuration], tmp_path: Path
+    quick: Callable[..., Configuration], recorded_run: Callable[[str], Path]
 ) -> None:
-    configuration = quick()
-    trace = run_graph(configuration, tmp_path, record=True)
-    bag = read_bag(tmp_path / 'bag')
+    configuration = quick('lag_pressure')
+    folder = recorded_run('lag_pressure')
+    trace, bag = load_trace(folder / 'trace.npz'), read_bag(folder / 'bag')
     assert bag.warnings == []
     run = trace_of(bag)
     assert run.warnings == []

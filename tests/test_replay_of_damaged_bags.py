@@ -188,7 +188,7 @@ def put(topic: str, field: str, value: Any, first: int = 20) -> Callable[[str, A
     return change
 
 
-@pytest.mark.parametrize('value', [1e300, -1e300, np.inf, -np.inf, np.nan])
+@pytest.mark.parametrize('value', [1e300, -np.inf, np.nan])
 @pytest.mark.parametrize('field', ['mu_pressure', 'strain', 'force', 'source_pressure'])
 def test_impossible_measurements_end_in_no_warning_of_numpy(
     field: str, value: float, tmp_path: Path

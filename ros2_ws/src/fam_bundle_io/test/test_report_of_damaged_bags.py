@@ -12,7 +12,7 @@ import pytest
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_io.report import ReportedRun, reported_runs, without_nan
 from fam_bundle_io.report_page import report_page
-from fam_bundle_model.parameters import load_configuration
+from fam_bundle_model.parameters import Configuration, load_configuration
 
 CONFIG = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 PAGES = 20  # the first of so many cases is drawn too, which takes longer
@@ -24,16 +24,23 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
 
 
 @pytest.fixture(scope='module')
-def true(whole: Callable[[str], Path]) -> Callable[[str], ReportedRun]:
+def true(
+    whole: Callable[[str], Path], configuration: Configuration
+) -> Callable[[str], ReportedRun]:
     """Return what gives the report of a whole bag, made once."""
     known: dict[str, ReportedRun] = {}
 
     def report(kind: str) -> ReportedRun:
         if kind not in known:
-            (known[kind],) = reported_runs(whole(kind), kind, load_configuration(CONFIG))[0]
+            (known[kind],) = reported_runs(whole(kind), kind, configuration)[0]
         return known[kind]
 
     return report
+
+
+@pytest.fixture(scope='module')
+def configuration() -> Configuration:
+    return load_configuration(CONFIG)
 
 
 def told(run: ReportedRun) -> str:
@@ -47,12 +54,13 @@ def test_a_damaged_bag_gives_the_numbers_of_the_whole_one_or_a_warning(
     name: str,
     whole: Callable[[str], Path],
     true: Callable[[str], ReportedRun],
+    configuration: Configuration,
     tmp_path: Path,
 ) -> None:
     case = damage.CASES[name]
     path = case.make(whole(case.of), tmp_path / 'bag', random.Random(name))
     try:
-        runs, warnings = reported_runs(path, 'damaged', load_configuration(CONFIG))
+        runs, warnings = reported_runs(path, 'damaged', configuration)
     except BagError as error:
         assert '\n' not in f'{error}'
         return
