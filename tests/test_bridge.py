@@ -28,6 +28,7 @@ from fam_bundle_io.hardware.calibration import HardwareFile, load_hardware
 from fam_bundle_model.parameters import Configuration, write_yaml
 
 Make = Callable[..., Configuration]
+SHORT = {'amplitude': 0.06, 'frequency': 0.5, 'cycles': 1}
 
 
 @pytest.fixture(scope='module')
@@ -43,7 +44,7 @@ def test_through_the_bridge_the_experiment_is_the_same(
     quick: Make, hardware: HardwareFile, tmp_path: Path
 ) -> None:
     """Without converters' steps it differs only by the first commands, which arm the bridge."""
-    configuration = quick('lag_pressure')
+    configuration = quick('lag_pressure', reference=SHORT)
     direct = measure_tracking(configuration, run_offline(configuration))
     found = run_experiment(
         configuration, 'lockstep', tmp_path, hardware=with_bits(hardware, 0), record=True
@@ -67,7 +68,7 @@ def test_through_the_bridge_the_experiment_is_the_same(
 
 
 def test_sixteen_bits_change_little(quick: Make, hardware: HardwareFile, tmp_path: Path) -> None:
-    configuration = quick('baseline')
+    configuration = quick('baseline', reference=SHORT)
     direct = measure_tracking(configuration, run_offline(configuration))
     found = run_experiment(configuration, 'lockstep', tmp_path, hardware=with_bits(hardware, 16))
     assert found.metrics['iae'] == pytest.approx(direct.iae, rel=0.05)

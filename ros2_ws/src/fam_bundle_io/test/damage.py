@@ -82,7 +82,9 @@ def message(kind: str, tick: int) -> bytes:
         elif base[0] == 'bool':
             values[field] = value > 0
         else:
-            values[field] = value if base[0] == 'float64' else tick * 7 % 1000
+            # Few states of recruitment: a report counts in each of them.
+            most = 20 if field == 'recruited' else 1000
+            values[field] = value if base[0] == 'float64' else tick * 7 % most
     return bytes(STORE.serialize_cdr(make[kind](**values), kind))
 
 

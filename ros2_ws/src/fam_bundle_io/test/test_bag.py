@@ -141,11 +141,11 @@ def test_what_shaped_a_run_stands_at_the_head_of_each_file(tmp_path: Path) -> No
     types = store()
     writer = BagWriter(tmp_path / 'bag', split_size=1, head={'some.record': {'key': 'value'}})
     writer.add_topic(Topic('/sample', TYPE, DEFINITION))
-    for tick in range(5000):
+    for tick in range(20):
         writer.write(Item('/sample', tick, tick, 0, sample(types, tick)))
     writer.close()
     files = list((tmp_path / 'bag').glob('*.mcap'))
-    assert len(files) > 1
+    assert len(files) == 20
     for file in files:
         content = file.read_bytes()
         file.write_bytes(content[: content.index(b'value') + 100])  # a crash soon after
