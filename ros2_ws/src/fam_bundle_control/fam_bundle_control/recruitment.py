@@ -270,7 +270,9 @@ def recruitment_step(
     if law.lag_compensation:
         armed = armed or mu_pressure[newest] >= fam.deslack_pressure(units[newest].fam, strain)
         up = saturation <= lag.lag and lasts
-        down = desaturation <= -release.lag and not comes_back
+        # At rest nothing is released, whatever is expected: a reference may be about to go on.
+        falls = expected.strain_rate < -law.predictor.minimum_strain_rate
+        down = desaturation <= -release.lag and falls and not comes_back
         below = state.below + dt if down else 0.0
         # A noisy strain rate calls for a release now and then; not for a whole lag.
         down = down and (not law.by_force or below > release.lag)
