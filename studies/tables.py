@@ -34,22 +34,29 @@ NAMES = ('vermilion', 'blue', 'green', 'orange', 'light blue')
 def chart(
     title: str, x: tuple[str, Sequence[str]], unit: str, lines: dict[str, Sequence[float]]
 ) -> str:
-    """Return a line chart for Mermaid; it knows no legend, so the title tells the colours."""
-    told = ', '.join(f'{name} ({colour})' for name, colour in zip(lines, NAMES, strict=False))
+    """Return a line chart for Mermaid, and under it what its colours are: it knows no legend."""
+    told = ', '.join(f'{colour}: {name}' for name, colour in zip(lines, NAMES, strict=False))
     labels = ', '.join(f'"{label}"' for label in x[1])
+    top = 1.05 * max(max(values) for values in lines.values())
     drawn = [f'    line [{", ".join(f"{v:.4g}" for v in values)}]' for values in lines.values()]
     return '\n'.join(
         [
             '```mermaid',
             '%%{init: {"themeVariables": {"xyChart": {"plotColorPalette": "' + COLOURS + '"}}}}%%',
             'xychart-beta',
-            f'    title "{title}: {told}"',
+            f'    title "{title}"',
             f'    x-axis "{x[0]}" [{labels}]',
-            f'    y-axis "{unit}"',
+            f'    y-axis "{unit}" 0 --> {top:.2g}',
             *drawn,
             '```',
+            f'*{told}*',
         ]
     )
+
+
+def numbered(count: int) -> list[str]:
+    """Return the numbers of the rows of a table: its labels would not fit under a chart."""
+    return [str(k) for k in range(1, count + 1)]
 
 
 def both(rows: Rows, names: Sequence[str] = SINGLE) -> str:
@@ -152,9 +159,9 @@ def references(folder: Path) -> str:
         scheme: rows[rows.scheme == scheme]['best_threshold.max_error_ratio'].tolist()
         for scheme in ('lag_pressure', 'force', 'orderly')
     }
-    labels = [str(label) for label in rows.reference.unique()]
+    labels = numbered(rows.reference.nunique())
     title = 'Maximum error over that of the best threshold'
-    drawn = chart(title, ('reference', labels), 'ratio', lines)
+    drawn = chart(title, ('reference, as in the first table', labels), 'ratio', lines)
     return '\n\n'.join([markdown(head, table), against_rivals(rows), drawn])
 
 
@@ -188,7 +195,8 @@ def prediction(folder: Path) -> str:
         for name in ('acceleration', 'sinusoid', 'preview')
     }
     title = 'lag_pressure, no noise: maximum error over that at constant rate'
-    drawn = chart(title, ('reference', [str(label) for label in base.index]), 'ratio', lines)
+    x = ('reference, as in the study file', numbered(len(base)))
+    drawn = chart(title, x, 'ratio', lines)
     table_text = markdown([*head, 'cases with needless shifts (constant rate)'], table)
     return '\n\n'.join([table_text, drawn])
 
