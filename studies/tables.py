@@ -252,12 +252,11 @@ def reserve(folder: Path) -> str:
             ]
             table.append([f'{kept / 1e3:g}', *cells])
         parts += [f'{label}:', markdown(['reserve (kPa)', *schemes], table)]
-        kept = [f'{k / 1e3:g}' for k in sorted(found['recruitment.reserve'].unique())]
+        rising = found.sort_values('recruitment.reserve')
+        kept = [f'{k / 1e3:g}' for k in rising['recruitment.reserve'].unique()]
         lines = {
-            scheme: (
-                100.0 * found[found.scheme == scheme].sort_values('recruitment.reserve')[name]
-            ).tolist()
-            for scheme, name in (('lag_pressure', 'max_error'), ('force', 'max_error'))
+            scheme: (100.0 * rising[rising.scheme == scheme].max_error).tolist()
+            for scheme in ('lag_pressure', 'force')
         }
         parts.append(chart(f'Maximum error, {label}', ('reserve (kPa)', kept), '% strain', lines))
     return '\n\n'.join(parts)
