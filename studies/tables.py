@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Prints the tables of docs/studies.md from the results of the studies.
+"""
+Prints the tables of docs/studies.md from the results of the studies.
 
 python studies/tables.py runs/study     # the folder that holds grid, references, ...
 """
 
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+import sys
 
 import pandas as pd
 

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shared pieces of the tests of the whole system."""
 
+from collections.abc import Callable, Iterator
 import functools
 import os
+from pathlib import Path
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
-
-import pytest
 
 from fam_bundle_bringup.experiment import default_configuration, run_experiment
 from fam_bundle_model.parameters import Configuration, load_configuration
+import pytest
 
 # One quick cycle in which every scheme shifts up and down.
 QUICK = {'amplitude': 0.06, 'frequency': 0.25, 'cycles': 1}
@@ -33,7 +32,8 @@ def quick() -> Callable[..., Configuration]:
 def recorded_run(
     tmp_path_factory: pytest.TempPathFactory, quick: Callable[..., Configuration]
 ) -> Callable[[str], Path]:
-    """Return what gives the folder of a quick experiment through the graph, run once a scheme.
+    """
+    Return what gives the folder of a quick experiment through the graph, run once a scheme.
 
     A bag is with it.
     """

@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Our reader and three others decode every message of a recorded run to the same values."""
 
+from collections.abc import Callable, Iterator
 import json
+from pathlib import Path
 import shutil
 import struct
 import subprocess
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
-
-import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
-from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from fam_bundle_io.bag import read_bag
 from fam_bundle_model.parameters import Configuration
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+import pytest
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 NPM_READER = Path(__file__).parent / 'readers' / 'read.mjs'
 EACH_TICK = ('/bundle_state', '/pressure_reference', '/recruitment_state', '/valve_command')

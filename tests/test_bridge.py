@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The hardware bridge in place of the plant simulator lets valves move only if told."""
 
+from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
 import os
+from pathlib import Path
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
-
-import numpy as np
-import pytest
 
 from fam_bundle_bringup.experiment import (
     default_configuration,
@@ -26,6 +23,8 @@ from fam_bundle_bringup.processes import executable
 from fam_bundle_io.bag import read_bag, trace_of
 from fam_bundle_io.hardware.calibration import HardwareFile, load_hardware
 from fam_bundle_model.parameters import Configuration, write_yaml
+import numpy as np
+import pytest
 
 Make = Callable[..., Configuration]
 SHORT = {'amplitude': 0.06, 'frequency': 0.5, 'cycles': 1}

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults of a rig behind the hardware bridge, on any machine, however slow: counts, no times.
+"""
+Faults of a rig behind the hardware bridge, on any machine, however slow: counts, no times.
 
 ``./fam faults --backend volts`` has all of them, and times.
 """
 
+from collections.abc import Iterator
 import signal
 import time
-from collections.abc import Iterator
-
-import pytest
 
 from fam_bundle_bringup.bridge_rig import BridgeRig
 from fam_bundle_bringup.bridge_verdicts import (
@@ -21,6 +20,7 @@ from fam_bundle_bringup.bridge_verdicts import (
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_io.hardware.calibration import MU_PRESSURE
 from fam_bundle_model.parameters import load_configuration
+import pytest
 
 BAD_SAMPLES = 4  # limits.sensor_samples
 

@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the command line writes, and how it refuses."""
 
-import json
-import subprocess
 from collections.abc import Callable
+import json
 from pathlib import Path
-
-import numpy as np
-import pytest
-import yaml
-from scipy.integrate import trapezoid
+import subprocess
 
 from fam_bundle_bringup.cli import main
 from fam_bundle_bringup.experiment import default_configuration
-from fam_bundle_io.trace import PER_UNIT, SCALARS, load_trace
+from fam_bundle_io.trace import load_trace, PER_UNIT, SCALARS
+import numpy as np
+import pytest
+from scipy.integrate import trapezoid
+import yaml
 
 Fam = Callable[..., 'subprocess.CompletedProcess[str]']
 

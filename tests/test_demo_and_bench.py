@@ -1,23 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """The demo and the benchmark write what they promise, on a short reference."""
 
-import json
-import shutil
 from collections.abc import Callable
+import json
 from pathlib import Path
+import shutil
 from typing import Any
-
-import numpy as np
-import pytest
 
 from fam_bundle_bringup import bench, demo, hindsight
 from fam_bundle_bringup.experiment import Result, run_experiment
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.report_files import write_report
 from fam_bundle_io.shapes import paper_claims
-from fam_bundle_io.trace import Trace, load_trace
-from fam_bundle_model.parameters import PAPER_SCHEMES, Configuration, load_configuration
+from fam_bundle_io.trace import load_trace, Trace
+from fam_bundle_model.parameters import Configuration, load_configuration, PAPER_SCHEMES
 from fam_bundle_model.schema import ConfigurationError
+import numpy as np
+import pytest
 
 FIGURES = {
     'figure_06_response',

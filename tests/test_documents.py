@@ -1,19 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The documents say what the code says: parameters, nodes, topics, commands and links.
+"""
+The documents say what the code says: parameters, nodes, topics, commands and links.
 
 Run as a script, it prints the parameter tables for ``fam_bundle_model/README.md``.
 """
 
 import argparse
 import ast
-import re
 from collections.abc import Iterator
 from pathlib import Path
+import re
 from typing import Any, NamedTuple
 
-import pytest
 from ament_index_python.packages import get_package_prefix
-
 from fam_bundle_bringup.cli import parser
 from fam_bundle_io.hardware.calibration import (
     FlowCalibration,
@@ -29,6 +28,7 @@ from fam_bundle_model.parameters import GROUPS
 from fam_bundle_model.schema import Declaration, declarations, required
 from fam_bundle_node.loop_node import COMMON
 from fam_bundle_sim.volts_backend import FAULTS, VoltsOptions
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / 'ros2_ws' / 'src'

@@ -4,18 +4,17 @@
 import dataclasses
 from typing import Any
 
-import numpy as np
-import pytest
-
 from fam_bundle_bringup.experiment import default_configuration, metrics_of
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.energy import Energy, energy, energy_by_state, powers, summary
-from fam_bundle_io.metrics import Window, ticks_in, time_at_source, time_in_state, whole_cycles
-from fam_bundle_io.trace import Trace, empty_trace
+from fam_bundle_io.metrics import ticks_in, time_at_source, time_in_state, whole_cycles, Window
+from fam_bundle_io.trace import empty_trace, Trace
 from fam_bundle_model import fam
 from fam_bundle_model.bundle import motor_units, state_force
-from fam_bundle_model.parameters import GRAVITY, Configuration, load_configuration
-from fam_bundle_sim.plant import UNITS, plant, plant_step, resting_state, truth
+from fam_bundle_model.parameters import Configuration, GRAVITY, load_configuration
+from fam_bundle_sim.plant import plant, plant_step, resting_state, truth, UNITS
+import numpy as np
+import pytest
 
 Found = tuple[Configuration, Trace, Energy, Window]
 
@@ -35,7 +34,8 @@ def found(request: pytest.FixtureRequest) -> Found:
 
 
 def test_what_goes_in_comes_out(found: Found) -> None:
-    """What the balance leaves is what the force law of slack muscles makes or takes.
+    """
+    What the balance leaves is what the force law of slack muscles makes or takes.
 
     Over a settled cycle nothing is stored, but in the compressive regions the force law has no
     energy function: the oil does the work p dV on the muscles, these F dL on the load, and both
@@ -146,7 +146,8 @@ def random_trace(units: int = 3, ticks: int = 2000) -> Trace:
 
 
 def test_no_valve_makes_energy_and_what_is_not_lost_is_in_the_units() -> None:
-    """Tellegen: at every tick the source's power is the units' and the losses'; none is negative.
+    """
+    Tellegen: at every tick the source's power is the units' and the losses'; none is negative.
 
     Units above the source push oil back through an open supply land, some of it into other
     units, some through the source; a unit below the tank takes oil from it.

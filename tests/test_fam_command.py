@@ -2,9 +2,11 @@
 """The command ./fam itself, in a small tree of its own whose tools are all imitations."""
 
 import ast
+from importlib.machinery import SourceFileLoader
 import importlib.util
 import json
 import os
+from pathlib import Path
 import re
 import shutil
 import signal
@@ -12,8 +14,6 @@ import stat
 import subprocess
 import sys
 import time
-from importlib.machinery import SourceFileLoader
-from pathlib import Path
 
 import pytest
 

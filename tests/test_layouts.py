@@ -1,22 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The layouts for PlotJuggler and Foxglove show signals that exist, and all of the paper's."""
 
-import json
-import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from functools import cache
 from itertools import product
+import json
 from pathlib import Path
+import re
 from typing import Any, NamedTuple
-
-import numpy as np
-import pytest
+import xml.etree.ElementTree as ElementTree
 
 from fam_bundle_bringup.experiment import default_configuration
-from fam_bundle_io.bag import COLUMNS, LOOP, Bag, read_bag
+from fam_bundle_io.bag import Bag, COLUMNS, LOOP, read_bag
 from fam_bundle_io.message_definitions import complete_definition
 from fam_bundle_model.parameters import load_configuration
+import numpy as np
+import pytest
 
 LAYOUTS = Path(__file__).resolve().parents[1] / 'ros2_ws/src/fam_bundle_bringup/layouts'
 PLOTJUGGLER, FOXGLOVE = LAYOUTS / 'plotjuggler.xml', LAYOUTS / 'foxglove.json'

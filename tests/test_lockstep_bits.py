@@ -4,13 +4,12 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-import pytest
-
 from fam_bundle_bringup.graph import run_graph
 from fam_bundle_bringup.offline import run_offline
-from fam_bundle_io.trace import PER_UNIT, SCALARS, Trace, load_trace
-from fam_bundle_model.parameters import SCHEMES, Configuration
+from fam_bundle_io.trace import load_trace, PER_UNIT, SCALARS, Trace
+from fam_bundle_model.parameters import Configuration, SCHEMES
+import numpy as np
+import pytest
 
 
 def assert_same_bits(one: Trace, other: Trace) -> None:

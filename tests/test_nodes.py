@@ -1,18 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Single nodes as a user starts them: parameters, services, refusal of bad data."""
 
+from collections.abc import Callable, Iterator
 import dataclasses
+from pathlib import Path
 import subprocess
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
-
-import numpy as np
-import pytest
-import rclpy
-from rcl_interfaces.srv import DescribeParameters, ListParameters
-from rclpy.node import Node
 
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_bringup.graph import NODES, own_domain
@@ -24,6 +18,11 @@ from fam_bundle_msgs.msg import BundleState, LagTable, PressureReference
 from fam_bundle_msgs.srv import GetLagTable, QueryLag, RebuildLagTable
 from fam_bundle_node.lag_table_message import from_message, to_message
 from fam_bundle_node.qos import LATCHED, LOOP_PUBLISHER, LOOP_SUBSCRIPTION
+import numpy as np
+import pytest
+from rcl_interfaces.srv import DescribeParameters, ListParameters
+import rclpy
+from rclpy.node import Node
 
 PATIENCE = 60.0  # s; only a hang takes that long
 CONFIGURATION = default_configuration()

@@ -3,15 +3,14 @@
 
 from pathlib import Path
 
-import numpy as np
-import pytest
-
 from fam_bundle_bringup.experiment import checked_configuration
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.trace import Trace
 from fam_bundle_model import fam
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.parameters import Configuration
+import numpy as np
+import pytest
 
 CONFIG = Path(__file__).parents[1] / 'ros2_ws' / 'src' / 'fam_bundle_bringup' / 'config'
 # Held where two units are enough, then in a fifth of a second to where all four are needed.

@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's experiment: Table 2, and references that nothing was tuned for."""
 
-import itertools
 from collections.abc import Mapping
-
-import numpy as np
-import pytest
+import itertools
 
 from fam_bundle_bringup.demo import PAPER
 from fam_bundle_bringup.experiment import (
@@ -14,9 +11,11 @@ from fam_bundle_bringup.experiment import (
     measure_tracking,
 )
 from fam_bundle_bringup.offline import run_offline
-from fam_bundle_io.metrics import Tracking, shift_times
+from fam_bundle_io.metrics import shift_times, Tracking
 from fam_bundle_io.trace import Trace
-from fam_bundle_model.parameters import SCHEMES, Configuration, load_configuration
+from fam_bundle_model.parameters import Configuration, load_configuration, SCHEMES
+import numpy as np
+import pytest
 
 
 def run(scheme: str, **reference: float) -> tuple[Configuration, Trace, Tracking]:
@@ -82,7 +81,8 @@ def test_halving_the_substep_changes_no_strain(scheme: str) -> None:
 def test_any_number_of_motor_units_runs_and_well_at_gains_by_size(
     counts: list[int], mass: float, highest: int
 ) -> None:
-    """At the gain for two FAMs a smaller unit rings, but follows.
+    """
+    At the gain for two FAMs a smaller unit rings, but follows.
 
     Where none does, no valve opens and closes more than once in each rise and fall of the
     reference and at each shift of any unit: by 1 at most, and back.

@@ -2,16 +2,15 @@
 """A run owns its processes: a dead node ends it with its name, and nothing outlives it."""
 
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
-
-import pytest
 
 from fam_bundle_bringup.graph import NODES
 from fam_bundle_io.trace import load_trace
+import pytest
 
 PATIENCE = 60.0  # s; only a hang takes that long
 

@@ -1,26 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The graph on a clock and in one process: what holds on any machine, however slow.
+"""
+The graph on a clock and in one process: what holds on any machine, however slow.
 
 No test here depends on how punctual the machine is; ``./fam bench`` and ``./fam faults`` measure.
 """
 
+from collections.abc import Callable, Iterator
 import dataclasses
 import json
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
-
-import numpy as np
-import pytest
 
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_bringup.graph import (
-    LOOP_LISTENERS,
     drain,
     drain_patience,
+    LOOP_LISTENERS,
     nodes_in,
     own_domain,
     recording,
@@ -35,6 +33,8 @@ from fam_bundle_bringup.system_faults import shares_memory
 from fam_bundle_bringup.verdicts import first_bump
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration, write_yaml
+import numpy as np
+import pytest
 
 SHORT = {'amplitude': 0.06, 'frequency': 0.5, 'cycles': 1}
 
@@ -171,7 +171,8 @@ def test_a_time_out_below_two_periods_is_refused(quick: Callable[..., Configurat
 def rig(
     quick: Callable[..., Configuration], tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Rig]:
-    """Return a running loop in real time that no test's machine is too slow for.
+    """
+    Return a running loop in real time that no test's machine is too slow for.
 
     One for all tests here, each of which leaves it running.
     """

@@ -1,22 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run through the graph is recorded whole, and its bag gives the same trace."""
 
+from collections.abc import Callable, Iterator
 import json
 import os
+from pathlib import Path
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
-
-import pytest
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
-from std_msgs.msg import UInt64
 
 from fam_bundle_bringup.cli import recorded_lines
 from fam_bundle_bringup.graph import own_domain
@@ -26,6 +17,14 @@ from fam_bundle_io.bag import read_bag, trace_of
 from fam_bundle_io.bag_recorder_node import BagRecorder
 from fam_bundle_io.trace import load_trace
 from fam_bundle_model.parameters import Configuration
+import pytest
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import UInt64
 
 LOOP = ('/bundle_state', '/pressure_reference', '/recruitment_state', '/valve_command')
 

@@ -1,28 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a recorder that is killed, or whose disk is full, leaves behind; and what it records."""
 
+from collections.abc import Callable, Iterator
 import contextlib
+from itertools import pairwise
 import json
 import os
+from pathlib import Path
 import resource
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from itertools import pairwise
-from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
-import pytest
-from mcap.reader import make_reader
 
 from fam_bundle_bringup.graph import LOOP_LISTENERS, nodes_in, own_domain, start_nodes
 from fam_bundle_bringup.processes import executable
 from fam_bundle_io.bag import loop_topics, read_bag, trace_of
 from fam_bundle_io.recover import look
 from fam_bundle_model.parameters import Configuration, write_yaml
+from mcap.reader import make_reader
+import numpy as np
+import pytest
 
 LOOP = ('bundle_state', 'pressure_reference', 'recruitment_state', 'valve_command')
 PATIENCE = 60.0  # s; only a hang takes that long

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """``./fam recover`` tells a whole bag from a damaged one, and refuses in one line."""
 
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
-
-import pytest
+import subprocess
 
 from fam_bundle_io.bag import read_bag
 from fam_bundle_io.bag_writer import BagFolder, Item, Topic
+import pytest
 
 COUNT = 20_000
 Fam = Callable[..., 'subprocess.CompletedProcess[str]']

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """References that are no sine, through the whole loop offline: window, figures, files."""
 
-import json
 from collections.abc import Callable
+import json
 from pathlib import Path
-
-import numpy as np
-import pytest
 
 from fam_bundle_bringup.cli import main
 from fam_bundle_bringup.expectation import expectation
@@ -18,18 +15,20 @@ from fam_bundle_bringup.experiment import (
 )
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.figures import comparison_figure, prediction_figure, run_figure
-from fam_bundle_io.metrics import Window, ticks_in, whole_cycles
-from fam_bundle_io.trace import Trace, load_trace
+from fam_bundle_io.metrics import ticks_in, whole_cycles, Window
+from fam_bundle_io.trace import load_trace, Trace
 from fam_bundle_model.bundle import check_reachable, motor_units
 from fam_bundle_model.parameters import (
+    Configuration,
     CYCLIC,
     KINDS,
-    PREDICTORS,
-    Configuration,
     load_configuration,
+    PREDICTORS,
 )
 from fam_bundle_model.reference import reference_law, strain_reference
 from fam_bundle_model.schema import ConfigurationError
+import numpy as np
+import pytest
 
 CURVE = {'times': [0.0, 1.0, 2.5, 4.0], 'strains': [0.0, 0.02, 0.12, 0.03]}
 Run = Callable[[str], tuple[Configuration, Trace]]

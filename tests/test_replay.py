@@ -1,24 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recorded run gives the same commands again; and they, through the plant, the same run."""
 
+from collections.abc import Callable
 import json
 import math
+from pathlib import Path
+from signal import SIGCONT, SIGSTOP
 import struct
 import subprocess
 import time
-from collections.abc import Callable
-from pathlib import Path
-from signal import SIGCONT, SIGSTOP
 from typing import Any
-
-import numpy as np
-import pytest
 
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_bringup.graph import (
+    close_bag,
     LOOP_LISTENERS,
     NODES,
-    close_bag,
     nodes_in,
     own_domain,
     run_graph,
@@ -26,21 +23,23 @@ from fam_bundle_bringup.graph import (
 )
 from fam_bundle_bringup.processes import executable
 from fam_bundle_bringup.replay import run_replay
-from fam_bundle_bringup.replay_controllers import Samples, Stamp, same_bits, samples_of
+from fam_bundle_bringup.replay_controllers import same_bits, Samples, samples_of, Stamp
 from fam_bundle_bringup.replay_plant import measured, measured_state, strain_rate
 from fam_bundle_io.bag import LOOP as NAMES
 from fam_bundle_io.bag import read_bag, run_tables
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_io.completeness import tick_of
 from fam_bundle_model.parameters import (
-    GRAVITY,
-    PAPER_SCHEMES,
     Configuration,
+    GRAVITY,
     load_configuration,
+    PAPER_SCHEMES,
     write_yaml,
 )
 from fam_bundle_model.schema import ConfigurationError
-from fam_bundle_sim.plant import STRAIN_RATE, plant, truth
+from fam_bundle_sim.plant import plant, STRAIN_RATE, truth
+import numpy as np
+import pytest
 
 SHORT = {'amplitude': 0.06, 'frequency': 0.5, 'cycles': 1}  # two seconds, a shift up and down
 TICKS = 2000

@@ -1,19 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """A replay of a damaged or foreign bag: an error in one line, or a result; never a traceback."""
 
+from collections.abc import Callable, Iterator
 import functools
 import json
-import random
-import warnings
-from collections.abc import Callable, Iterator
 from pathlib import Path
+import random
 from typing import Any
+import warnings
 
 import damage
-import numpy as np
-import pytest
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
 from fam_bundle_bringup import replay_controllers
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_bringup.replay import run_replay
@@ -22,6 +18,9 @@ from fam_bundle_io.bag_writer import BagError, BagFolder, Item, Topic
 from fam_bundle_model import bundle
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_sim import plant
+import numpy as np
+import pytest
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 CONFIG = default_configuration()
 STATE, COMMAND, RECRUITMENT = '/bundle_state', '/valve_command', '/recruitment_state'

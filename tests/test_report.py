@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The report tells what the runs were, also of bags that are cut short or miss topics."""
 
+from collections.abc import Callable
 import csv
 import json
 import math
-import subprocess
-from collections.abc import Callable
 from pathlib import Path
+import subprocess
 from typing import Any
-
-import numpy as np
-import pytest
 
 from fam_bundle_io.bag import read_bag, trace_of
 from fam_bundle_io.bag_writer import BagError
@@ -21,6 +18,8 @@ from fam_bundle_io.report_page import extremes
 from fam_bundle_io.timing import applied_spool, phases, timing
 from fam_bundle_io.trace import load_trace
 from fam_bundle_model.parameters import Configuration
+import numpy as np
+import pytest
 
 Make = Callable[..., Configuration]
 Fam = Callable[..., 'subprocess.CompletedProcess[str]']
@@ -123,7 +122,8 @@ def copied(
     ticks: int | None = None,
     shift: Callable[[int], int] = lambda number: 0,
 ) -> Path:
-    """Copy the messages for which ``keep(topic, number)`` with the mcap package itself.
+    """
+    Copy the messages for which ``keep(topic, number)`` with the mcap package itself.
 
     At most ``ticks`` of each topic, each of its times moved by ``shift(number)`` ns.
     """
@@ -244,7 +244,7 @@ def test_a_new_report_takes_the_place_of_an_earlier_one(runs: Path, tmp_path: Pa
 def altered(bag: Path, folder: Path, change: Callable[[str, Any], None]) -> Path:
     """Write the messages anew by rosbags, each after ``change(topic, message)``."""
     from rosbags.rosbag2 import Reader, StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
     types = get_typestore(Stores.EMPTY)
     with (

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a report, in a real browser without network."""
 
-import json
-import shutil
 from collections.abc import Iterator
+import json
 from pathlib import Path
+import shutil
 from typing import Any
-
-import numpy as np
-import pytest
 
 from fam_bundle_io.metrics import Window
 from fam_bundle_io.report_files import write_report
+import numpy as np
+import pytest
 
 
 @pytest.fixture(scope='module')

@@ -1,30 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """``./fam doctor``, ``check-channels`` and ``zero``, on a rig that is broken on purpose."""
 
+from collections.abc import Callable, Iterator
 import dataclasses
 import os
+from pathlib import Path
 import re
 import resource
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
-
-import numpy as np
-import pytest
-import yaml
 
 from fam_bundle_bringup import doctor, rig_commands
 from fam_bundle_bringup.cli import main
 from fam_bundle_bringup.doctor import MISSING, OK, WARNING
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_io.hardware import backend as backend_module
-from fam_bundle_io.hardware.calibration import Scaling, load_hardware
+from fam_bundle_io.hardware.calibration import load_hardware, Scaling
 from fam_bundle_sim.plant import truth
 from fam_bundle_sim.volts_backend import VoltsBackend
+import numpy as np
+import pytest
+import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 VOLTS = default_configuration().with_name('volts_calibration.yaml')

@@ -4,17 +4,16 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pytest
-
 from fam_bundle_bringup.cli import main
-from fam_bundle_bringup.doctor import OK, WARNING, check_configuration
+from fam_bundle_bringup.doctor import check_configuration, OK, WARNING
 from fam_bundle_bringup.experiment import checked_configuration, default_configuration
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.bundle import motor_units, state_force
 from fam_bundle_model.doubts import doubts, ringing
-from fam_bundle_model.parameters import GRAVITY, Configuration, load_configuration
+from fam_bundle_model.parameters import Configuration, GRAVITY, load_configuration
+import numpy as np
+import pytest
 
 CONFIG = Path(__file__).parents[1] / 'ros2_ws' / 'src' / 'fam_bundle_bringup' / 'config'
 
@@ -28,7 +27,8 @@ def bundle(counts: list[int], share: float, **groups: Any) -> Configuration:
 
 
 def ringing_share(trace: Trace, frequency: float) -> float:
-    """Return the share of tenths of a second in which some spool swings as a ring would.
+    """
+    Return the share of tenths of a second in which some spool swings as a ring would.
 
     A ring at ``frequency`` (Hz) turns the spool round twice a period. Two thirds of that count,
     by steps of more than a thousandth of the stroke.

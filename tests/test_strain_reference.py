@@ -1,27 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The strain controller's own reference: goals, live values, and the latched law.
+"""
+The strain controller's own reference: goals, live values, and the latched law.
 
 The node runs in this process beside a bundle that is perfect: its strain is the reference of the
 tick before. Where trajectories are foreseen the supervisor is there too. Times are those of the
 run.
 """
 
+from collections.abc import Callable, Iterator
 import contextlib
 import math
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pandas as pd
-import pytest
-import rclpy
 from action_msgs.msg import GoalStatus
 from action_msgs.srv import CancelGoal
-from rclpy.action import ActionClient
-from rclpy.executors import Executor
-from rclpy.node import Node
-
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_bringup.graph import own_domain
 from fam_bundle_bringup.replay import tracked_laws
@@ -56,6 +49,13 @@ from fam_bundle_node import lag_table_message
 from fam_bundle_node.qos import CHANGES, LATCHED, LOOP_PUBLISHER, LOOP_SUBSCRIPTION, NEWEST
 from fam_bundle_node.reference_message import from_message, to_message
 from fam_bundle_node.run import make_executor
+import numpy as np
+import pandas as pd
+import pytest
+import rclpy
+from rclpy.action import ActionClient
+from rclpy.executors import Executor
+from rclpy.node import Node
 
 PERIOD = 1e-3
 PATIENCE = 30.0  # s

@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The study file: what is read, what is refused, and which cases it makes."""
 
+from collections.abc import Callable
 import itertools
+from pathlib import Path
 import re
 import runpy
-from collections.abc import Callable
-from pathlib import Path
-
-import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fam_bundle_bringup.cli import main, parser
-from fam_bundle_bringup.study import Case, Range, Sample, cases_of, read_study, sampled
+from fam_bundle_bringup.study import Case, cases_of, Range, read_study, Sample, sampled
 from fam_bundle_model.schema import ConfigurationError
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / 'ros2_ws' / 'src' / 'fam_bundle_bringup' / 'README.md'

@@ -1,35 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
 """Studies as they run: on processes, on Dask, killed and gone on with; and their results."""
 
+from collections.abc import Callable, Iterator
 import concurrent.futures
 import contextlib
 import csv
 import dataclasses
 import json
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
-
-import numpy as np
-import pytest
 
 from fam_bundle_bringup import hindsight, study_case, study_command, study_run
 from fam_bundle_bringup.cli import main
 from fam_bundle_bringup.experiment import measure_tracking
 from fam_bundle_bringup.hindsight import with_threshold
 from fam_bundle_bringup.offline import run_offline
-from fam_bundle_bringup.study import Study, cases_of, read_study
-from fam_bundle_bringup.study_case import MEASURED, Row, Setting, measured, run_case
+from fam_bundle_bringup.study import cases_of, read_study, Study
+from fam_bundle_bringup.study_case import MEASURED, measured, Row, run_case, Setting
 from fam_bundle_bringup.study_command import print_summary, run_cases
 from fam_bundle_bringup.study_result import read_result, result_of, write_result
 from fam_bundle_bringup.study_run import Done, Job, Journal
 from fam_bundle_io.metrics import NotMeasurable, shift_times
 from fam_bundle_model.schema import ConfigurationError
+import numpy as np
+import pytest
 
 SMALL = """
 changes: {reference.cycles: 1, reference.frequency: 1.0}
@@ -437,10 +436,9 @@ def test_two_studies_do_not_share_a_folder(tmp_path: Path) -> None:
 
 
 def test_provenance_is_in_the_file_and_beside_it(small: tuple[Study, Path]) -> None:
-    from pyarrow import parquet
-
     from fam_bundle_bringup.experiment import default_configuration
     from fam_bundle_model.parameters import load_configuration
+    from pyarrow import parquet
 
     _, out = small
     metadata = parquet.read_schema(out / 'study.parquet').metadata

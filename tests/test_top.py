@@ -1,29 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live view of the nodes: what it shows, which domain it finds, and what it hears."""
 
+from collections.abc import Iterator
 import itertools
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from pathlib import Path
-
-import pytest
-import rclpy
-from rclpy.node import Node
-from rich.console import Console
 
 from fam_bundle_bringup.cli import main
-from fam_bundle_bringup.domain_marker import Run, chosen_domain, marked, marker_folder, running
+from fam_bundle_bringup.domain_marker import chosen_domain, marked, marker_folder, Run, running
 from fam_bundle_bringup.graph import own_domain
 from fam_bundle_bringup.statistics_listener import Report, report_of
 from fam_bundle_bringup.top import plain_line, view
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_msgs.msg import LoopStatistics
 from fam_bundle_node.qos import REPORTS
+import pytest
+import rclpy
+from rclpy.node import Node
+from rich.console import Console
 
 NOW = 1000.0
 REASON = 'safe: valve_command: no answer since tick 81234'

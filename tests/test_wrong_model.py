@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Controllers that believe in another rig than the one that is there."""
 
-import dataclasses
 from collections.abc import Callable
-
-import pytest
+import dataclasses
 
 from fam_bundle_bringup.experiment import measure_tracking
 from fam_bundle_bringup.offline import run_offline
-from fam_bundle_io.metrics import Tracking, needless_shifts, shift_times
+from fam_bundle_io.metrics import needless_shifts, shift_times, Tracking
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.fam import deslack_pressure
-from fam_bundle_model.parameters import GRAVITY, Configuration
+from fam_bundle_model.parameters import Configuration, GRAVITY
+import pytest
 
 
 def test_a_rig_as_believed_changes_no_bit(quick: Callable[..., Configuration]) -> None:
@@ -38,7 +37,8 @@ def test_the_plant_is_the_actual_one_and_the_laws_are_not(
 def test_a_wrong_model_costs_tracking_but_not_stability(
     quick: Callable[..., Configuration],
 ) -> None:
-    """What is fed forward is then wrong, and the PI has the rest to do.
+    """
+    What is fed forward is then wrong, and the PI has the rest to do.
 
     It is nearer than nothing still, and than batch, which feeds nothing forward and shares
     nothing out by a model. Shifts come as the reference asks for them, by force and by batch.

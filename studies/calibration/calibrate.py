@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find the parameters that Kim & Bryant 2025 does not publish, from the six numbers of Table 2.
+"""
+Find the parameters that Kim & Bryant 2025 does not publish, from the six numbers of Table 2.
 
 A fit, not a validation: more free parameters than numbers. Bounds keep each parameter physical;
 objections keep the loop one that an engineer would accept: two shifts per cycle, no ripple in the
@@ -13,9 +14,6 @@ import multiprocessing
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from fam_bundle_bringup.demo import PAPER
 from fam_bundle_bringup.experiment import measure_tracking
 from fam_bundle_bringup.offline import run_offline
@@ -24,6 +22,8 @@ from fam_bundle_io.trace import Trace
 from fam_bundle_model.lag_table import build_lag_table
 from fam_bundle_model.parameters import load_configuration
 from fam_bundle_model.schema import ConfigurationError
+import numpy as np
+import numpy.typing as npt
 
 # Parameter: lowest, highest; searched on a logarithmic scale.
 BOUNDS = {
@@ -67,7 +67,8 @@ def away_from_shifts(trace: Trace, start: float) -> npt.NDArray[np.bool_]:
 
 
 def objections(trace: Trace, cycles: int, start: float) -> list[float]:
-    """Return what an engineer would object to, each 0 when there is nothing.
+    """
+    Return what an engineer would object to, each 0 when there is nothing.
 
     Shifts beyond one pair per cycle, ripple of the pressures, error of the inner loop.
     """

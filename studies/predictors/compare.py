@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far each predictor is off, on strains that follow a reference with some error and noise.
+"""
+How far each predictor is off, on strains that follow a reference with some error and noise.
 
 There is no plant here. The strain follows its reference as a PI loop around a spring does, at the
 outer loop's gains in ``lhacd.yaml`` and a stiffness of 4 MPa per unit strain: the error of the
@@ -7,24 +8,23 @@ paper's runs between the shifts, without the shifts.
 """
 
 import argparse
-import dataclasses
 from collections.abc import Iterator
-
-import numpy as np
-import numpy.typing as npt
+import dataclasses
 
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_control.predictors import (
-    Predictor,
-    PredictorState,
     expected_strain,
+    Predictor,
     predictor,
     predictor_start,
     predictor_step,
+    PredictorState,
 )
 from fam_bundle_model.compile import compiled
-from fam_bundle_model.parameters import PREDICTORS, Configuration, load_configuration
+from fam_bundle_model.parameters import Configuration, load_configuration, PREDICTORS
 from fam_bundle_model.reference import Reference, reference_law, strain_reference
+import numpy as np
+import numpy.typing as npt
 
 DT = 1e-3  # s
 STIFFNESS = 4e6  # Pa per unit strain, about that of the bundle between 4 and 12 % strain

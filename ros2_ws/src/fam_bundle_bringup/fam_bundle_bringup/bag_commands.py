@@ -1,10 +1,23 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The commands that work on bags: ``./fam report``, ``./fam replay`` and ``./fam recover``."""
 
 import argparse
 import os
-import sys
 from pathlib import Path
+import sys
 from typing import Any
 
 from fam_bundle_bringup.progress import progress_bar
@@ -53,7 +66,8 @@ def _add_configuration(command: argparse.ArgumentParser) -> None:
 
 
 def run_bag_command(options: argparse.Namespace) -> int:
-    """Run one of the commands and return its exit status.
+    """
+    Run one of the commands and return its exit status.
 
     Raises ConfigurationError for a bad parameter file, OSError where nothing can be written.
     """

@@ -1,28 +1,42 @@
-# SPDX-License-Identifier: Apache-2.0
-"""How fast and how punctual the loop is on this machine, beside what it could be at best.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How fast and how punctual the loop is on this machine, beside what it could be at best.
 
 Every candidate runs once in each round, so that a machine whose speed drifts treats all alike;
 ratios are taken within a round. Medians and spread are over the rounds.
 """
 
+from collections.abc import Callable, Mapping
 import dataclasses
 import importlib.util
 import os
+from pathlib import Path
 import re
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from fam_bundle_bringup.experiment import versions
 from fam_bundle_bringup.graph import (
-    LOOP_LISTENERS,
     drain,
     drain_patience,
+    LOOP_LISTENERS,
     nodes_in,
     own_domain,
     recording,
@@ -146,7 +160,8 @@ def graph_runs(
     recorded: bool = False,
     bundles: int = 1,
 ) -> list[Run]:
-    """Return what the plants of one run said, one for each of ``bundles`` side by side.
+    """
+    Return what the plants of one run said, one for each of ``bundles`` side by side.
 
     Raises RuntimeError when a node ends early.
     """
@@ -195,7 +210,8 @@ def lag_table(configuration: Configuration) -> Values:
 
 
 def first_tick(configuration: Configuration) -> Values:
-    """Measure from the start of the Python command line to the plant's first tick.
+    """
+    Measure from the start of the Python command line to the plant's first tick.
 
     ``./fam`` itself takes a few tenths of a second before that.
     """
@@ -380,7 +396,8 @@ def machine(configuration: Configuration) -> Values:
 
 
 def measurements() -> list[Measurement]:
-    """Return all candidates in the order in which each round runs them.
+    """
+    Return all candidates in the order in which each round runs them.
 
     Cyclone DDS is one only where its Python package is installed.
     """
@@ -438,7 +455,8 @@ def derived(found: Values) -> Values:
 
 
 def run_bench(configuration: Configuration, folder: Path, rounds: int) -> None:
-    """Run every candidate once in each of ``rounds``, and write ``bench.json`` and a figure.
+    """
+    Run every candidate once in each of ``rounds``, and write ``bench.json`` and a figure.
 
     Raises RuntimeError when a candidate fails.
     """

@@ -1,32 +1,44 @@
-# SPDX-License-Identifier: Apache-2.0
-"""What goes wrong with a rig behind the hardware bridge, done on purpose: one row each.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What goes wrong with a rig behind the hardware bridge, done on purpose: one row each.
 
 Bounds are those of ``limits.py``, and margins of ``bridge_verdicts.py`` for a machine that wakes
 late. Where nothing else is said a stand-in takes the place of the controllers.
 """
 
-import signal
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+import signal
+import time
 from typing import Any
-
-import numpy as np
 
 from fam_bundle_bringup.bridge_rig import BridgeRig
 from fam_bundle_bringup.bridge_verdicts import (
     AFTER,
-    MARGIN,
-    PROMPT,
-    Found,
     beyond_limit,
     degraded,
     depressurised,
     ended,
     faulted,
+    Found,
     goes_on,
     latched,
     listen_for,
+    MARGIN,
+    PROMPT,
     reset_and_armed,
     said,
     vented_to,
@@ -35,7 +47,7 @@ from fam_bundle_bringup.bridge_verdicts import (
 from fam_bundle_bringup.faulty_bridge import SHUTDOWN
 from fam_bundle_bringup.graph import BRIDGE
 from fam_bundle_bringup.process_faults import STOPPED, WAITS
-from fam_bundle_bringup.verdicts import VENTED, Fault, both
+from fam_bundle_bringup.verdicts import both, Fault, VENTED
 from fam_bundle_io.hardware.calibration import (
     FORCE,
     MU_PRESSURE,
@@ -45,6 +57,7 @@ from fam_bundle_io.hardware.calibration import (
 )
 from fam_bundle_io.hardware.limits import Limits
 from fam_bundle_node.loop_node import LOOK_PERIOD
+import numpy as np
 
 NAME = BRIDGE[1]
 LIMITS = Limits()  # the defaults, which the rig has too
@@ -211,7 +224,8 @@ def refused(rig: BridgeRig) -> int:
 
 
 def one_bad(spool: list[float]) -> Hurt:
-    """Return how to send one bad command among good ones.
+    """
+    Return how to send one bad command among good ones.
 
     One that a newer one overtakes within the period is never looked at, so it is sent again.
     """

@@ -1,9 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The options by which an experiment goes through the hardware bridge."""
 
 import argparse
-import sys
 from pathlib import Path
+import sys
 
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_io.hardware.backend import backend_names
@@ -61,7 +74,8 @@ def check_backend(backend: str | None, options: argparse.Namespace) -> None:
 def hardware_of(
     backend: str | None, path: Path | None, configuration: Configuration
 ) -> HardwareFile | None:
-    """Return the rig that the options ask for; on a real one valves move only if told so.
+    """
+    Return the rig that the options ask for; on a real one valves move only if told so.
 
     Raises ConfigurationError.
     """

@@ -1,30 +1,43 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The graph around the hardware bridge and a simulated card that outlives it, under observation.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The graph around the hardware bridge and a simulated card that outlives it, under observation.
 
 What is out, and since when, is taken from the log of the card, a process of its own.
 """
 
+from collections.abc import Callable, Mapping
 import contextlib
 import dataclasses
 import os
+from pathlib import Path
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
-from pathlib import Path
 from types import TracebackType
 from typing import Any
-
-import numpy as np
-import numpy.typing as npt
 
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_bringup.graph import BRIDGE, LOOP_LISTENERS, NODES
 from fam_bundle_bringup.processes import executable
 from fam_bundle_bringup.rig import Rig, Seen
-from fam_bundle_io.hardware.calibration import Scaling, load_hardware, write_hardware
+from fam_bundle_io.hardware.calibration import load_hardware, Scaling, write_hardware
 from fam_bundle_model.parameters import Configuration
 from fam_bundle_sim.volts_card import read_log
+import numpy as np
+import numpy.typing as npt
 
 CARD = ('fam_bundle_sim', 'volts_card')
 PACKAGES = {name: p for p, name in (*NODES, BRIDGE) if name != 'plant_simulator'}
@@ -71,7 +84,8 @@ class BridgeRig(Rig):
     topics = ()
 
     def __init__(self, configuration: Configuration, folder: Path, **limits: float) -> None:
-        """Write the files of the rig to ``folder``; start nothing yet.
+        """
+        Write the files of the rig to ``folder``; start nothing yet.
 
         ``limits`` are laid over those of ``limits.py``.
         """
@@ -201,7 +215,8 @@ class BridgeRig(Rig):
         return [min(max(spool, -1.0), 1.0)] + [-1.0] * (len(sample.mu_pressure) - 1)
 
     def arm(self) -> None:
-        """Arm, and return when the loop runs undisturbed; what the machine spoils is reset.
+        """
+        Arm, and return when the loop runs undisturbed; what the machine spoils is reset.
 
         Raises NotQuietError when that never is.
         """
@@ -248,7 +263,8 @@ class BridgeRig(Rig):
         return bool(self.call(ChangeState, 'change_state', request).success)
 
     def inject(self, fault: str, *channels: int) -> int:
-        """Break the rig and return when that was (ns, steady); without a fault mend it.
+        """
+        Break the rig and return when that was (ns, steady); without a fault mend it.
 
         Raises RuntimeError where the bridge refuses.
         """
@@ -307,7 +323,8 @@ class BridgeRig(Rig):
         return safe
 
     def safe_since(self, since: int) -> int | None:
-        """Return from when on the safe volts have been out without a break (ns), if they are.
+        """
+        Return from when on the safe volts have been out without a break (ns), if they are.
 
         That is ``since`` at the earliest.
         """
@@ -317,7 +334,8 @@ class BridgeRig(Rig):
         return int(rows['time'][after]) if after < len(rows) else None
 
     def is_quiet(self, end: float) -> bool:
-        """Return whether valves follow commands at last, and nothing holds them up for a while.
+        """
+        Return whether valves follow commands at last, and nothing holds them up for a while.
 
         False when the bridge is not armed any more, or at the time ``end`` (s, steady).
         """

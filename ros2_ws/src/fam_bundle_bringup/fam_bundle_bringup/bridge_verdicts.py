@@ -1,19 +1,32 @@
-# SPDX-License-Identifier: Apache-2.0
-"""What is asked of the hardware bridge after a fault: observations in words, each with a verdict.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What is asked of the hardware bridge after a fault: observations in words, each with a verdict.
 
 Whether valves are safe is read from the card's log, in time and in samples that were taken.
 """
 
+from collections.abc import Callable
 import contextlib
 import math
-from collections.abc import Callable
-
-import numpy as np
 
 from fam_bundle_bringup.bridge_rig import BridgeRig
 from fam_bundle_bringup.graph import BRIDGE
-from fam_bundle_bringup.verdicts import VENTED, both
-from fam_bundle_io.hardware.calibration import MU_PRESSURE, SOURCE_PRESSURE, Scaling
+from fam_bundle_bringup.verdicts import both, VENTED
+from fam_bundle_io.hardware.calibration import MU_PRESSURE, Scaling, SOURCE_PRESSURE
+import numpy as np
 
 Found = tuple[str, bool]
 
@@ -28,7 +41,8 @@ REPORT = 3.0  # s in which a reason must stand on /diagnostics; a report comes o
 def went_safe(
     rig: BridgeRig, since: int, within: float, samples: float = math.inf, *, vents: bool = True
 ) -> Found:
-    """Return whether the safe volts were out in time, and stayed, and the rig vented.
+    """
+    Return whether the safe volts were out in time, and stayed, and the rig vented.
 
     ``within`` is in s from ``since`` (ns) on, ``samples`` how many may be taken before.
     """
@@ -149,7 +163,8 @@ def degraded(rig: BridgeRig, since: int, channel: int) -> Found:
 
 
 def beyond_limit(rig: BridgeRig, since: int) -> tuple[int, int] | None:
-    """Return when the last of too many samples beyond a limit of pressure was taken (ns).
+    """
+    Return when the last of too many samples beyond a limit of pressure was taken (ns).
 
     And how many more were taken before the safe volts were out. None: never so many.
     """

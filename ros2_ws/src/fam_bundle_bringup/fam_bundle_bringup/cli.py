@@ -1,38 +1,51 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The command line: what ``./fam`` passes on."""
 
 import argparse
+from collections.abc import Callable, Mapping, Sequence
 import importlib.util
 import math
+from pathlib import Path
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from fam_bundle_bringup.bag_commands import NAMES as BAG_COMMANDS
 from fam_bundle_bringup.bag_commands import add_bag_commands, run_bag_command
+from fam_bundle_bringup.bag_commands import NAMES as BAG_COMMANDS
 from fam_bundle_bringup.bridge_options import add_bridge_options, check_backend, hardware_of
 from fam_bundle_bringup.domain_marker import domain_number
 from fam_bundle_bringup.experiment import (
-    PACES,
-    RESULTS,
     checked_configuration,
     default_configuration,
+    PACES,
     prepare_folder,
+    RESULTS,
 )
 from fam_bundle_bringup.one_line_parser import Parser
-from fam_bundle_bringup.rig_commands import NAMES as RIG_COMMANDS
 from fam_bundle_bringup.rig_commands import add_rig_commands, run_rig_command
+from fam_bundle_bringup.rig_commands import NAMES as RIG_COMMANDS
 from fam_bundle_bringup.study_command import add_study, run_study
 from fam_bundle_model.doubts import doubts
 from fam_bundle_model.parameters import (
     ALLOCATIONS,
+    Configuration,
     KINDS,
     PREDICTORS,
     SCHEMES,
-    Configuration,
 )
 from fam_bundle_model.reference_file import read_samples
 from fam_bundle_model.schema import ConfigurationError
@@ -178,7 +191,8 @@ def _argument(convert: Callable[[str], Any]) -> Callable[[str], Any]:
 
 
 def reference_of(text: str | None) -> dict[str, dict[str, Any]]:
-    """Return the changes that ``--reference`` asks for: a kind, or the samples in a file.
+    """
+    Return the changes that ``--reference`` asks for: a kind, or the samples in a file.
 
     Raises ConfigurationError when the file holds none.
     """

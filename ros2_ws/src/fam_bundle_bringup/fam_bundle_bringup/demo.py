@@ -1,22 +1,35 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The paper's experiment under every scheme: Table 2, its figures, and how alike they are."""
 
+from collections.abc import Mapping
 import dataclasses
 import importlib.util
-import shutil
-from collections.abc import Mapping
 from pathlib import Path
+import shutil
 from typing import TYPE_CHECKING
 
 from fam_bundle_bringup.expectation import expectation
-from fam_bundle_bringup.experiment import Result, last_cycle, run_experiment
-from fam_bundle_bringup.hindsight import THRESHOLDS, Rival, best_threshold, with_threshold
+from fam_bundle_bringup.experiment import last_cycle, Result, run_experiment
+from fam_bundle_bringup.hindsight import best_threshold, Rival, THRESHOLDS, with_threshold
 from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.progress import progress_bar
-from fam_bundle_io.metrics import Tracking, Window, slice_of
+from fam_bundle_io.metrics import slice_of, Tracking, Window
 from fam_bundle_io.shapes import Claim, paper_claims
 from fam_bundle_io.trace import Trace
-from fam_bundle_model.parameters import PAPER_SCHEMES, Configuration
+from fam_bundle_model.parameters import Configuration, PAPER_SCHEMES
 from fam_bundle_model.schema import ConfigurationError
 
 if TYPE_CHECKING:
@@ -30,7 +43,8 @@ PAPER = {
 
 
 def run_demo(configuration: Configuration, folder: Path) -> None:
-    """Run every scheme through the graph, print Table 2 and write all results to ``folder``.
+    """
+    Run every scheme through the graph, print Table 2 and write all results to ``folder``.
 
     Raises RunFailed when a run ends early.
     """
@@ -86,7 +100,8 @@ def with_scheme(
 
 
 def remove_bag(bag: Path) -> None:
-    """Remove the bag of an earlier demo, if there is one, whole or not.
+    """
+    Remove the bag of an earlier demo, if there is one, whole or not.
 
     Raises ConfigurationError where there is anything else in its place.
     """

@@ -1,21 +1,35 @@
-# SPDX-License-Identifier: Apache-2.0
-"""``./fam doctor``: is everything there that a run or a rig needs? One line for each thing.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+``./fam doctor``: is everything there that a run or a rig needs? One line for each thing.
 
 It must work where parts are broken: only the standard library is imported before a check begins,
 and a check that fails is a line too. No card is opened, and nothing is changed.
 """
 
 import argparse
+from collections.abc import Callable, Iterable, Iterator, Sequence
 import importlib
 import importlib.metadata
 import os
+from pathlib import Path
 import platform
 import resource
 import shutil
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 OK, WARNING, MISSING = 'ok', 'warning', 'missing'

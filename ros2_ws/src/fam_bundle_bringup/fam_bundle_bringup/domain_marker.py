@@ -1,14 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Which DDS domains runs of this user are in: one file each, locked by the run. No ROS."""
 
+from collections.abc import Iterator, Mapping
 import contextlib
 import fcntl
 import os
+from pathlib import Path
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import NamedTuple
 
 from fam_bundle_model.schema import ConfigurationError
@@ -32,7 +45,8 @@ def marker_folder() -> Path:
 
 @contextlib.contextmanager
 def marked(domain: int, folder: Path | None = None) -> Iterator[None]:
-    """Mark ``domain`` as that of this process.
+    """
+    Mark ``domain`` as that of this process.
 
     A marker only helps to find a run: where there can be none, a line on stderr says why.
     """
@@ -63,7 +77,8 @@ def domain_number(text: str) -> int:
 
 
 def chosen_domain(environment: Mapping[str, str], folder: Path | None = None) -> int | None:
-    """Return the domain that ``environment`` names, else that of the only run, else None.
+    """
+    Return the domain that ``environment`` names, else that of the only run, else None.
 
     Raises ConfigurationError when it names none or when there are several runs.
     """

@@ -1,13 +1,26 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """One experiment: check, run at a pace, and write its folder."""
 
+from collections.abc import Callable, Iterable, Mapping
 import dataclasses
 import importlib.metadata
 import json
 import os
-import platform
-from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+import platform
 from typing import Any, NamedTuple
 
 from fam_bundle_bringup.failure import RunFailed
@@ -17,12 +30,12 @@ from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.completeness import ANSWERS
 from fam_bundle_io.energy import energy, powers, summary
 from fam_bundle_io.hardware.calibration import HardwareFile, write_hardware
-from fam_bundle_io.metrics import Tracking, Window, shift_times, tracking
-from fam_bundle_io.trace import Trace, save_trace
+from fam_bundle_io.metrics import shift_times, Tracking, tracking, Window
+from fam_bundle_io.trace import save_trace, Trace
 from fam_bundle_model.bundle import check_reachable, motor_units
 from fam_bundle_model.parameters import (
-    Configuration,
     check_period,
+    Configuration,
     load_configuration,
     write_yaml,
 )
@@ -50,7 +63,8 @@ def default_configuration() -> Path:
 def checked_configuration(
     path: Path, changes: Mapping[str, Mapping[str, Any]] | None = None, *, offline: bool = False
 ) -> Configuration:
-    """Return the configuration in ``path`` with ``changes`` if the rig can do what it asks.
+    """
+    Return the configuration in ``path`` with ``changes`` if the rig can do what it asks.
 
     Raises ConfigurationError naming parameter, value and bound.
     """
@@ -60,7 +74,8 @@ def checked_configuration(
 
 
 def check_feasible(configuration: Configuration, *, offline: bool = True) -> None:
-    """Raise ConfigurationError, naming parameter, value and bound, unless the rig can run it.
+    """
+    Raise ConfigurationError, naming parameter, value and bound, unless the rig can run it.
 
     ``offline`` tells that there is no graph, from which a live reference could come.
     """
@@ -87,7 +102,8 @@ def check_length(configuration: Configuration) -> None:
 
 
 def last_cycle(configuration: Configuration) -> tuple[float, float]:
-    """Return start and end of the last cycle in s: the settled one, if there are two.
+    """
+    Return start and end of the last cycle in s: the settled one, if there are two.
 
     The whole run where the reference does not repeat.
     """
@@ -156,7 +172,8 @@ def loop_of(reports: list[dict[str, Any]]) -> dict[str, Any]:
 def with_bridge(
     configuration: Configuration, pace: str, hardware: HardwareFile, path: Path
 ) -> Configuration:
-    """Write ``hardware`` to ``path`` and return the configuration of a bridge that uses it.
+    """
+    Write ``hardware`` to ``path`` and return the configuration of a bridge that uses it.
 
     A simulated rig takes the pace of the run, and rests until the first command.
     """
@@ -192,7 +209,8 @@ def bag_of(bag: Path) -> dict[str, Any]:
 
 
 def prepare_folder(folder: Path, results: Iterable[str]) -> None:
-    """Make ``folder`` and take away ``results`` of an earlier call in it.
+    """
+    Make ``folder`` and take away ``results`` of an earlier call in it.
 
     Raises ConfigurationError when it cannot be written to.
     """
@@ -216,7 +234,8 @@ def run_experiment(
     hardware: HardwareFile | None = None,
     record: bool = False,
 ) -> Result:
-    """Run ``configuration`` and write its parameters, trace and metrics to ``folder``.
+    """
+    Run ``configuration`` and write its parameters, trace and metrics to ``folder``.
 
     With ``hardware`` the hardware bridge takes the place of the plant simulator.
     With ``record`` all topics go to the bag ``folder / 'bag'``, which must not exist.

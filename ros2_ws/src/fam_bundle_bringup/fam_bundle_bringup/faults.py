@@ -1,23 +1,36 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What goes wrong with a loop in real time, done to it on purpose: one row and verdict each."""
 
-import dataclasses
 from collections.abc import Iterator
+import dataclasses
 from pathlib import Path
 from typing import NamedTuple
 
 from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.message_faults import DAMAGES, FLOOD, injected
 from fam_bundle_bringup.process_faults import (
-    STOPPED,
-    WAITS,
     held_up,
     held_up_plant,
     held_up_server,
     killed,
     killed_plant,
     killed_server,
+    STOPPED,
     two_supervisors,
+    WAITS,
 )
 from fam_bundle_bringup.progress import progress_bar
 from fam_bundle_bringup.rig import Rig
@@ -25,7 +38,7 @@ from fam_bundle_bringup.system_faults import (
     stepped_clock,
     without_shared_memory,
 )
-from fam_bundle_bringup.verdicts import HARMLESS, SAFE_WITHIN, Fault
+from fam_bundle_bringup.verdicts import Fault, HARMLESS, SAFE_WITHIN
 from fam_bundle_model.parameters import Configuration
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.checks import CHECKS
@@ -117,7 +130,8 @@ def tried_at_bridge(fault: Fault, configuration: Configuration, folder: Path) ->
 def run_faults(
     configuration: Configuration, folder: Path, only: str = '', *, bridge: bool = False
 ) -> bool:
-    """Try every fault whose name contains ``only``; write ``faults.json``, print the table.
+    """
+    Try every fault whose name contains ``only``; write ``faults.json``, print the table.
 
     ``bridge`` asks for those of the hardware bridge, on the simulated rig in volts. Returns
     whether all passed.

@@ -1,16 +1,28 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The hardware bridge, with an error in one of its methods once a file exists. For faults only."""
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
+import sys
 from typing import Any
-
-import rclpy
 
 from fam_bundle_io.hardware.monitor import Monitor
 from fam_bundle_io.hardware_bridge_node import HardwareBridge
 from fam_bundle_node.run import run_node
+import rclpy
 
 SHUTDOWN = 'shutdown'  # no error: ROS's context is shut down in the command's callback
 

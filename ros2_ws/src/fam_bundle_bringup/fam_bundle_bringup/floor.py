@@ -1,19 +1,33 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The floor of the lock-step: bare relays in the loop's topology, which compute nothing.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The floor of the lock-step: bare relays in the loop's topology, which compute nothing.
 
 Same processes, topics, messages and qualities of service as the loop: what these relays need for
 a tick, no controller in Python can save.
 """
 
+from collections.abc import Callable, Mapping, Sequence
 import contextlib
 import json
 import math
 import os
+from pathlib import Path
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from fam_bundle_bringup.graph import LOOP_LISTENERS, own_domain
@@ -46,7 +60,8 @@ POLL = 0.05  # s between two looks at the processes
 
 
 class Measured(NamedTuple):
-    """Rate in ticks/s; times in s from just before a publication to the callback of its answer.
+    """
+    Rate in ticks/s; times in s from just before a publication to the callback of its answer.
 
     On a clock from when it was due, and the share of periods with an answer in time.
     """
@@ -59,7 +74,8 @@ class Measured(NamedTuple):
 
 
 def relay_loop(ticks: int, units: int) -> Measured:
-    """Run ``ticks`` ticks of ``units`` motor units through the four relays.
+    """
+    Run ``ticks`` ticks of ``units`` motor units through the four relays.
 
     Raises RuntimeError, with the last line of a log, when one fails or the time runs out.
     """
@@ -68,7 +84,8 @@ def relay_loop(ticks: int, units: int) -> Measured:
 
 
 def relay_on_a_clock(seconds: float, units: int, period: float, priority: int) -> Measured:
-    """Run the four relays on a clock of ``period`` (s), with the ``priority`` of SCHED_FIFO.
+    """
+    Run the four relays on a clock of ``period`` (s), with the ``priority`` of SCHED_FIFO.
 
     Raises RuntimeError, with the last line of a log, when one fails or the time runs out.
     """
@@ -80,7 +97,8 @@ def relay_on_a_clock(seconds: float, units: int, period: float, priority: int) -
 
 
 def relay_ping(ticks: int, units: int) -> Measured:
-    """Send ``ticks`` bundle states of ``units`` motor units to one process, which answers each.
+    """
+    Send ``ticks`` bundle states of ``units`` motor units to one process, which answers each.
 
     Raises RuntimeError, with the last line of a log, when one fails or the time runs out.
     """
@@ -96,7 +114,8 @@ def measure_ticks(
     environment: Mapping[str, str],
     *more: str,
 ) -> Measured:
-    """Run ``module`` in one process per role until the first role has counted its ticks.
+    """
+    Run ``module`` in one process per role until the first role has counted its ticks.
 
     Each gets its role, ``ticks``, ``units`` and ``more`` as arguments. Raises RuntimeError, with
     the last line of a log, when one fails or the time runs out.
@@ -115,7 +134,8 @@ def run_roles(
     environment: Mapping[str, str],
     timeout: float,
 ) -> dict[str, Any]:
-    """Run ``module`` in one process per role until the first has ended; return what it found.
+    """
+    Run ``module`` in one process per role until the first has ended; return what it found.
 
     What it found is the JSON object of the last line that it printed. The other roles are ended.
     Raises RuntimeError, with the last line of a log, when one fails or ``timeout`` (s) has passed.
@@ -206,7 +226,8 @@ class BareNode:
     """A node of rclpy with the loop's topics; nothing checks, nothing computes."""
 
     def __init__(self, role: str, ticks: int, units: int, period: int = 0) -> None:
-        """Take part in the loop as ``role``, on a clock if ``period`` (ns) is not 0.
+        """
+        Take part in the loop as ``role``, on a clock if ``period`` (ns) is not 0.
 
         Raises KeyError when there is no such role.
         """
@@ -296,9 +317,8 @@ class BareNode:
 
     def spin(self) -> None:
         """Run until the last tick is answered, or until told to stop."""
-        import rclpy
-
         from fam_bundle_node.run import make_executor
+        import rclpy
 
         executor = make_executor()
         executor.add_node(self._node)

@@ -1,9 +1,24 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The relays of ``floor`` without ROS: through Unix-domain sockets, and through Cyclone DDS.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The relays of ``floor`` without ROS: through Unix-domain sockets, and through Cyclone DDS.
 
 The same processes, topology and payload: what is left of a tick when the middleware goes.
 """
 
+from collections.abc import Callable
 import contextlib
 import functools
 import importlib
@@ -12,18 +27,17 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 from fam_bundle_bringup.floor import (
     JOINED,
+    loop_message,
     LOOP_ROLES,
     MATCHING_PERIOD,
-    MESSAGE_TYPES,
-    Measured,
-    RoundTrips,
-    loop_message,
     measure_ticks,
+    Measured,
+    MESSAGE_TYPES,
+    RoundTrips,
     tune_process,
 )
 from fam_bundle_bringup.graph import LOOP_LISTENERS, own_domain
@@ -61,7 +75,8 @@ CYCLONE = """<CycloneDDS><Domain>
 
 
 def socket_loop(ticks: int, units: int) -> Measured:
-    """Run ``ticks`` ticks of ``units`` motor units through datagrams of Unix-domain sockets.
+    """
+    Run ``ticks`` ticks of ``units`` motor units through datagrams of Unix-domain sockets.
 
     Raises RuntimeError, with the last line of a log, when one fails or the time runs out.
     """
@@ -70,7 +85,8 @@ def socket_loop(ticks: int, units: int) -> Measured:
 
 
 def cyclone_loop(ticks: int, units: int) -> Measured:
-    """Run ``ticks`` ticks of ``units`` motor units through Cyclone DDS, which is optional.
+    """
+    Run ``ticks`` ticks of ``units`` motor units through Cyclone DDS, which is optional.
 
     Raises RuntimeError, with the last line of a log, when it is missing, when one fails or the
     time runs out.
@@ -144,7 +160,8 @@ def _connect(outbox: socket.socket, listener: str) -> None:
 
 
 def run_cyclone(role: str, trips: RoundTrips, units: int, domain: str) -> None:
-    """Take part in the loop as ``role`` through Cyclone DDS.
+    """
+    Take part in the loop as ``role`` through Cyclone DDS.
 
     With a wait set, not with listeners: these were no faster, and it warns of writing in them.
     """
@@ -153,7 +170,6 @@ def run_cyclone(role: str, trips: RoundTrips, units: int, domain: str) -> None:
     from cyclonedds.pub import DataWriter
     from cyclonedds.sub import DataReader
     from cyclonedds.topic import Topic
-
     from fam_bundle_node.qos import LOOP_PUBLISHER, LOOP_SUBSCRIPTION
 
     participant, waiting = DomainParticipant(int(domain)), []
@@ -208,7 +224,8 @@ def _cyclone_qos(profile: 'QoSProfile') -> Any:
 
 @functools.cache
 def idl_type(kind: str) -> Any:
-    """Return the type of Cyclone DDS for ``kind`` in ROS, as ``double`` or ``std_msgs/Header``.
+    """
+    Return the type of Cyclone DDS for ``kind`` in ROS, as ``double`` or ``std_msgs/Header``.
 
     Raises ValueError for a kind that the loop's messages do not need.
     """

@@ -1,21 +1,34 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The loop as a graph: five nodes, each its own process or all in one, over Fast DDS."""
 
+from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import os
+from pathlib import Path
 import signal
 import subprocess
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 from fam_bundle_bringup.domain_marker import marked
 from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_bringup.json_file import write_json
-from fam_bundle_bringup.processes import NodeDied, NodeGroup, executable
+from fam_bundle_bringup.processes import executable, NodeDied, NodeGroup
 from fam_bundle_bringup.this_machine import stay_on_this_machine
 from fam_bundle_io.bag_writer import BagError
-from fam_bundle_io.trace import Trace, empty_trace
+from fam_bundle_io.trace import empty_trace, Trace
 from fam_bundle_model.parameters import Configuration, write_yaml
 
 if TYPE_CHECKING:
@@ -62,7 +75,8 @@ def start_nodes(
     bridge: bool = False,
     bundle: str = '',
 ) -> str:
-    """Start the nodes with one parameter file, each as a process or all in one.
+    """
+    Start the nodes with one parameter file, each as a process or all in one.
 
     ``bridge`` asks for the hardware bridge in place of the plant simulator, ``bundle`` names the
     namespace of one of several. Returns the name of the process that ends with the run.
@@ -88,7 +102,8 @@ def run_graph(
     bridge: bool = False,
     record: bool = False,
 ) -> Trace:
-    """Run ``configuration`` through the graph and return its trace.
+    """
+    Run ``configuration`` through the graph and return its trace.
 
     With ``bridge`` the hardware bridge takes the place of the plant simulator.
 
@@ -169,7 +184,8 @@ def drain(recorder: 'TraceRecorder', listen: Callable[[float], None], patience: 
 
 
 def drain_patience(configuration: Configuration) -> float:
-    """Return how long (s) the last answers may take.
+    """
+    Return how long (s) the last answers may take.
 
     In real time a sample may have none. In lock-step each has: a message that was lost on the way
     is sent again with the middleware's next heartbeat, three seconds later.
@@ -186,7 +202,8 @@ def nodes_in(folder: Path) -> NodeGroup:
 def recording(
     bundles: Sequence[str] = ('',), *, keep: bool = True
 ) -> Iterator[tuple[list['TraceRecorder'], Callable[[float], None]]]:
-    """Give a trace recorder for each of ``bundles``, and a function that listens for some seconds.
+    """
+    Give a trace recorder for each of ``bundles``, and a function that listens for some seconds.
 
     A bundle is named by its namespace; all recorders are in this process, and ``keep`` messages or
     only the loop statistics.
@@ -205,15 +222,15 @@ def recording(
 def listening(
     make: Callable[[], list[Any]],
 ) -> Iterator[tuple[list[Any], Callable[[float], None]]]:
-    """Give the nodes that ``make`` returns, in this process, and a function that runs them.
+    """
+    Give the nodes that ``make`` returns, in this process, and a function that runs them.
 
     It takes for how long (s).
     """
+    from fam_bundle_node.run import make_executor
     import rclpy
     from rclpy.signals import SignalHandlerOptions
     from rclpy.task import Future
-
-    from fam_bundle_node.run import make_executor
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     with contextlib.ExitStack() as stack:

@@ -1,19 +1,31 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The strongest rival of an anticipatory scheme: a threshold tuned on the very reference."""
 
+from collections.abc import Callable
 import contextlib
 import dataclasses
-from collections.abc import Callable
 from typing import NamedTuple
-
-import numpy as np
 
 from fam_bundle_bringup.experiment import measure_tracking
 from fam_bundle_bringup.failure import RunFailed
 from fam_bundle_bringup.offline import run_offline
-from fam_bundle_io.metrics import Tracking, needless_shifts
+from fam_bundle_io.metrics import needless_shifts, Tracking
 from fam_bundle_model.lag_table import cached_lag_table
-from fam_bundle_model.parameters import Configuration, check_allocation
+from fam_bundle_model.parameters import check_allocation, Configuration
+import numpy as np
 
 THRESHOLDS = tuple(np.round(np.arange(0.40, 0.951, 0.01), 2).tolist())
 
@@ -27,7 +39,8 @@ class Rival(NamedTuple):
 
 
 def with_threshold(configuration: Configuration, threshold: float) -> Configuration:
-    """Return the baseline of ``configuration`` with another upshift threshold.
+    """
+    Return the baseline of ``configuration`` with another upshift threshold.
 
     Raises ConfigurationError where its allocation does not go with thresholds.
     """
@@ -43,7 +56,8 @@ def best_threshold(
     progress: Callable[[int], None] | None = None,
     actual: Configuration | None = None,
 ) -> Rival | None:
-    """Return the threshold with the least IAE among those that do not chatter, if there is one.
+    """
+    Return the threshold with the least IAE among those that do not chatter, if there is one.
 
     The runs are offline, ``actual`` as in ``run_offline``; one that diverges is no rival.
     ``progress`` is called with the thresholds tried so far.

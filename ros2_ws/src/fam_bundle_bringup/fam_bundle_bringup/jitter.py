@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """How late this machine wakes a process that only sleeps: the floor of a real-time pace."""
 
 import json
@@ -7,7 +20,7 @@ import sys
 import time
 from typing import NamedTuple
 
-from fam_bundle_bringup.floor import START_TIMEOUT, rank, run_roles, tune_process
+from fam_bundle_bringup.floor import rank, run_roles, START_TIMEOUT, tune_process
 from fam_bundle_node.pacing import Schedule, wait_until
 
 MODULE = 'fam_bundle_bringup.jitter'
@@ -27,7 +40,8 @@ class Jitter(NamedTuple):
 def wake_up_jitter(
     seconds: float, period: float, busy_tail: float = 0.0, priority: int = 0
 ) -> Jitter:
-    """Return how late a new process wakes that sleeps every ``period`` s, for ``seconds`` s.
+    """
+    Return how late a new process wakes that sleeps every ``period`` s, for ``seconds`` s.
 
     It spends the last ``busy_tail`` s of each wait awake, and has the process settings of the
     loop's nodes in real time, with ``priority`` as theirs. A wake-up later than the next
@@ -42,7 +56,8 @@ def wake_up_jitter(
 
 
 def wake_ups(periods: int, period: int, busy_tail: int) -> tuple[list[int], int]:
-    """Sleep through ``periods`` periods; return the lateness of each wake-up, and periods skipped.
+    """
+    Sleep through ``periods`` periods; return the lateness of each wake-up, and periods skipped.
 
     All times are in ns. The last wake-up may skip beyond the last period.
     """

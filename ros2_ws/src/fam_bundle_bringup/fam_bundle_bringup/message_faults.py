@@ -1,18 +1,31 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Bad messages beside the good ones."""
 
-import time
 from collections.abc import Callable
+import time
 from typing import Any
 
 from fam_bundle_bringup.rig import Rig
 from fam_bundle_bringup.verdicts import (
     AFTER,
-    HARMLESS,
-    IN_TIME,
-    Fault,
     both,
+    Fault,
+    HARMLESS,
     harmless_or_safe,
+    IN_TIME,
     reset,
     safe_and_said,
 )
@@ -99,7 +112,8 @@ def consumer(topic: str) -> str:
 
 
 def inject(rig: Rig, topic: str, damage: Damage, times: int) -> int:
-    """Publish damaged copies of the newest message; return when that was a fault (ns, steady).
+    """
+    Publish damaged copies of the newest message; return when that was a fault (ns, steady).
 
     That is with the third, or with the only one.
     """

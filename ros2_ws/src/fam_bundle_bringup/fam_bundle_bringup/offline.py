@@ -1,39 +1,52 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The whole loop in one process, without ROS: the same laws in the same order as the graph.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The whole loop in one process, without ROS: the same laws in the same order as the graph.
 
 Its trace equals that of the graph in lock-step to the last bit; a test holds the two together.
 """
 
-import itertools
 from collections.abc import Callable
-
-import numpy as np
-import numpy.typing as npt
+import itertools
 
 from fam_bundle_bringup.failure import RunFailed
-from fam_bundle_control.pressure_loop import PressureLoop, pressure_loop, pressure_loop_step
+from fam_bundle_control.pressure_loop import pressure_loop, pressure_loop_step, PressureLoop
 from fam_bundle_control.recruitment import (
     Recruitment,
-    RecruitmentState,
     recruitment,
     recruitment_start,
     recruitment_step,
+    RecruitmentState,
 )
 from fam_bundle_control.strain_loop import (
-    StrainLoop,
-    StrainLoopState,
     strain_loop,
     strain_loop_start,
     strain_loop_step,
+    StrainLoop,
+    StrainLoopState,
 )
-from fam_bundle_io.trace import Trace, empty_trace
-from fam_bundle_model.bundle import MotorUnit, motor_units
+from fam_bundle_io.trace import empty_trace, Trace
+from fam_bundle_model.bundle import motor_units, MotorUnit
 from fam_bundle_model.compile import compiled
-from fam_bundle_model.lag_table import LagTable, cached_lag_table
+from fam_bundle_model.lag_table import cached_lag_table, LagTable
 from fam_bundle_model.parameters import Configuration, seconds
 from fam_bundle_model.reference import Reference, reference_law, strain_reference
 from fam_bundle_sim.plant import Plant, plant, plant_step, resting_state, truth
-from fam_bundle_sim.sensors import Sensors, measure, noise_samples, sensors
+from fam_bundle_sim.sensors import measure, noise_samples, Sensors, sensors
+import numpy as np
+import numpy.typing as npt
 
 PREDICTED = (
     'time_to_saturation',
@@ -67,7 +80,8 @@ def run_block(
     mu_pressures: npt.NDArray[np.float64],
     spools: npt.NDArray[np.float64],
 ) -> tuple[StrainLoopState, RecruitmentState]:
-    """Run one tick for each of ``times`` and fill ``references`` and the rows of the trace.
+    """
+    Run one tick for each of ``times`` and fill ``references`` and the rows of the trace.
 
     ``units`` are those that the laws believe in. ``plant_state`` and ``integral`` are advanced in
     place, the other states returned.
@@ -155,7 +169,8 @@ def run_offline(
     table: LagTable | None = None,
     actual: Configuration | None = None,
 ) -> Trace:
-    """Return the trace of the whole run of ``configuration``.
+    """
+    Return the trace of the whole run of ``configuration``.
 
     ``progress`` is called with the ticks done so far; ``table`` spares the look-up of the lag
     table where the caller has it already. With ``actual`` plant and sensors are those of another

@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Nodes that are killed, held up, restarted or there twice."""
 
 import itertools
@@ -8,15 +21,15 @@ import time
 from fam_bundle_bringup.rig import Rig
 from fam_bundle_bringup.verdicts import (
     AFTER,
-    IN_TIME,
-    SAFE_WITHIN,
-    VENTED,
-    Fault,
     both,
+    Fault,
     goes_on,
     harmless_or_safe,
+    IN_TIME,
     reset,
     safe_and_said,
+    SAFE_WITHIN,
+    VENTED,
 )
 
 STOPPED = 0.5  # s that a node is held up

@@ -1,14 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The nodes of a run as processes: started together, watched, and always ended."""
 
+from collections.abc import Mapping, Sequence
 import contextlib
 import ctypes
 import os
+from pathlib import Path
 import signal
 import subprocess
 import time
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 STOP_TIMEOUT = 3.0  # s that a node gets to end by itself
@@ -70,7 +83,8 @@ class NodeGroup:
         return process
 
     def finished(self, *names: str) -> bool:
-        """Return whether all the nodes ``names`` have ended well.
+        """
+        Return whether all the nodes ``names`` have ended well.
 
         Raises NodeDied when any node has ended otherwise.
         """

@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """``./fam recover``: makes a whole bag out of a damaged one, and says what is in it."""
 
 from collections.abc import Iterator
@@ -7,11 +20,12 @@ from typing import Any
 
 from fam_bundle_bringup.progress import progress_bar
 from fam_bundle_io.completeness import unanswered
-from fam_bundle_io.recover import Recovery, look, recover_bag
+from fam_bundle_io.recover import look, recover_bag, Recovery
 
 
 def run_recover(bag: Path, out: Path | None) -> int:
-    """Recover ``bag`` into the folder ``out``, or ``BAG_recovered``, and return the exit status.
+    """
+    Recover ``bag`` into the folder ``out``, or ``BAG_recovered``, and return the exit status.
 
     A bag in which nothing is damaged is left as it is. Raises BagError.
     """

@@ -1,19 +1,31 @@
-# SPDX-License-Identifier: Apache-2.0
-"""``./fam replay``: a bag through the laws and through the simulated plant.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+``./fam replay``: a bag through the laws and through the simulated plant.
 
 Recorded samples into the controllers: do they still command what was recorded, to the last bit?
 And recorded commands into the plant: how good is the model?
 """
 
+from collections.abc import Iterator, Mapping
 import dataclasses
 import json
 import math
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from fam_bundle_bringup.experiment import prepare_folder, versions
 from fam_bundle_bringup.json_file import write_json
@@ -21,29 +33,29 @@ from fam_bundle_bringup.progress import progress_bar
 from fam_bundle_bringup.replay_controllers import (
     ANSWERS,
     COMMAND,
-    REFERENCE,
-    STATE,
-    Comparison,
-    Run,
-    Stamp,
     compare_tables,
+    Comparison,
+    REFERENCE,
     replay_controllers,
+    Run,
     samples_of,
+    Stamp,
+    STATE,
 )
 from fam_bundle_bringup.replay_plant import (
-    RESTART_PERIOD,
-    SIGNAL_UNITS,
     Deviation,
-    Simulated,
     deviations,
     measured,
     replay_plant,
+    RESTART_PERIOD,
+    SIGNAL_UNITS,
+    Simulated,
 )
-from fam_bundle_control.announced import BEGINNING, Announcement
+from fam_bundle_control.announced import Announcement, BEGINNING
 from fam_bundle_control.trajectory import FROM_OUTSIDE, LIVE
 from fam_bundle_io.bag import (
-    LOOP,
     Bag,
+    LOOP,
     loop_topics,
     read_bag,
     recorded_configuration,
@@ -51,11 +63,12 @@ from fam_bundle_io.bag import (
     runs_of,
 )
 from fam_bundle_io.bag_writer import BagError
-from fam_bundle_model.lag_table import LagTable, cached_lag_table, lag_table_hash
+from fam_bundle_model.lag_table import cached_lag_table, lag_table_hash, LagTable
 from fam_bundle_model.parameters import Configuration, load_configuration
 from fam_bundle_model.reference import reference_law
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.stamps import nanoseconds
+import numpy as np
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -90,7 +103,8 @@ class Replay(NamedTuple):
 
 
 def run_replay(bag: Path, config: Path | None, out: Path | None, namespace: str = '') -> bool:
-    """Replay the last run of a bundle in ``bag``; return whether its controllers do the same.
+    """
+    Replay the last run of a bundle in ``bag``; return whether its controllers do the same.
 
     To the last bit, wherever the record determines it. The parameters are those in the bag unless
     ``config`` is given; ``namespace`` is that of the bundle, '' the root. Results go to the folder
@@ -119,7 +133,8 @@ def run_replay(bag: Path, config: Path | None, out: Path | None, namespace: str 
 
 
 def choose(bag: Bag, path: Path, config: Path | None) -> Chosen:
-    """Return the parameters to replay with; the pace is always the recorded one, if there is one.
+    """
+    Return the parameters to replay with; the pace is always the recorded one, if there is one.
 
     Raises ConfigurationError when there are none.
     """
@@ -141,7 +156,8 @@ def choose(bag: Bag, path: Path, config: Path | None) -> Chosen:
 
 
 def tables_of(bag: Bag, space: str) -> 'tuple[dict[str, pd.DataFrame], list[str]]':
-    """Return what the last run of a bundle has on each topic, by tick, and what it lacks.
+    """
+    Return what the last run of a bundle has on each topic, by tick, and what it lacks.
 
     Raises BagError where it has no samples.
     """
@@ -230,7 +246,8 @@ def replay_of(
 def tracked_laws(
     table: 'pd.DataFrame | None', begun: int, configuration: Configuration
 ) -> tuple[list[Announcement], list[str]]:
-    """Return the trajectories of a run, that of its beginning first, and notes.
+    """
+    Return the trajectories of a run, that of its beginning first, and notes.
 
     The configured one is made of the parameters; live values, goals and the way back from them
     are taken from ``table``, the messages of the topic ``reference``. ``begun`` is when the run's
@@ -255,7 +272,8 @@ def tracked_laws(
 
 
 def messages_in(table: 'pd.DataFrame') -> Iterator[Any]:
-    """Give the messages in a table, whether or not their arrays are columns of their own.
+    """
+    Give the messages in a table, whether or not their arrays are columns of their own.
 
     A column for an element that a message does not have holds NaN there.
     """
@@ -279,7 +297,8 @@ def messages_in(table: 'pd.DataFrame') -> Iterator[Any]:
 def choose_lag_table(
     bag: Bag, configuration: Configuration, space: str
 ) -> tuple[LagTable, list[Comparison], list[str]]:
-    """Return the lag table for the supervisor, how it compares, and what there is to say of it.
+    """
+    Return the lag table for the supervisor, how it compares, and what there is to say of it.
 
     The recorded one, if it is of these parameters; and it is compared with the one that the lag
     table server would build of them.

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Recorded samples through the controllers' laws, and what these answer against what was recorded.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Recorded samples through the controllers' laws, and what these answer against what was recorded.
 
 Each controller is judged on its own: the pressure controller gets the recorded references and the
 supervisor the recorded lag table. The laws, their time steps and the rule when they start again
@@ -8,20 +22,17 @@ answer is in the bag, and no other: a law takes its step and the answer is publi
 """
 
 import bisect
-import dataclasses
 from collections.abc import Callable, Container, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+import dataclasses
+from typing import Any, NamedTuple, TYPE_CHECKING
 
-import numpy as np
-import numpy.typing as npt
-
-from fam_bundle_control.announced import NOTICE, Announced, Announcement
+from fam_bundle_control.announced import Announced, Announcement, NOTICE
 from fam_bundle_control.pressure_loop import pressure_loop, pressure_loop_step
 from fam_bundle_control.recruitment import (
-    RecruitmentOutput,
     recruitment,
     recruitment_start,
     recruitment_step,
+    RecruitmentOutput,
 )
 from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
 from fam_bundle_io.bag_writer import BagError
@@ -31,8 +42,10 @@ from fam_bundle_model.hydraulics import TO_TANK
 from fam_bundle_model.lag_table import LagTable
 from fam_bundle_model.parameters import Configuration, seconds
 from fam_bundle_model.reference import strain_reference
-from fam_bundle_node.stamps import StampClock, begins_anew, nanoseconds
+from fam_bundle_node.stamps import begins_anew, nanoseconds, StampClock
 from fam_bundle_node.ticks import TickError
+import numpy as np
+import numpy.typing as npt
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -72,7 +85,8 @@ class Stamp(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """The ``bundle_state`` of a run, one entry for each sample; ``mu_pressure`` (n, units).
+    """
+    The ``bundle_state`` of a run, one entry for each sample; ``mu_pressure`` (n, units).
 
     ``published`` is a time of the system clock (ns).
     """
@@ -88,7 +102,8 @@ class Samples(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One run: its samples, the tables of what answered them by topic and tick, and its pace.
+    """
+    One run: its samples, the tables of what answered them by topic and tick, and its pace.
 
     ``laws`` are the trajectories that were tracked, that of the beginning first.
     """
@@ -129,7 +144,8 @@ def per_unit(table: 'pd.DataFrame', field: str) -> npt.NDArray[np.float64]:
 
 
 class Steps(NamedTuple):
-    """The steps that a law took: of which sample (its row), over which time (s), from where.
+    """
+    The steps that a law took: of which sample (its row), over which time (s), from where.
 
     ``anew`` tells that it started again there. Whether the record determines the law's state is
     ``known``: not before its first start, nor between a step that the bag does not show and the
@@ -145,7 +161,8 @@ class Steps(NamedTuple):
 def steps_of(
     samples: Samples, taken: Iterable[int], usable: Container[int], configuration: Configuration
 ) -> Steps:
-    """Return the steps of a law that took the ticks ``taken``, of which the bag has ``usable``.
+    """
+    Return the steps of a law that took the ticks ``taken``, of which the bag has ``usable``.
 
     Raises TickError when time stands still.
     """
@@ -265,7 +282,8 @@ def supervisor_answers(
 def pressure_answers(
     configuration: Configuration, run: Run, steps: Steps, progress: Progress
 ) -> Columns:
-    """Return what the pressure controller answers to the recorded references.
+    """
+    Return what the pressure controller answers to the recorded references.
 
     Whether it asked for the safe state is taken from the record: it did where three of its inputs
     could not be used, and such ones are not in the bag as it saw them.
@@ -310,7 +328,8 @@ def _columns(fields: Iterable[str], rows: list[tuple[Any, ...]]) -> Columns:
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """One signal: how many values were compared, and how many are equal to the last bit.
+    """
+    One signal: how many values were compared, and how many are equal to the last bit.
 
     ``largest`` is the largest absolute difference in ``unit``; ``tick`` that of the first, and
     there ``replayed`` and ``recorded`` the values. Ticks at which the record does not determine
@@ -337,7 +356,8 @@ def compare(
     ticks: npt.NDArray[np.int64],
     known: npt.NDArray[np.bool_],
 ) -> list[Comparison]:
-    """Return the comparison of each of the ``replayed`` columns with those of ``table``.
+    """
+    Return the comparison of each of the ``replayed`` columns with those of ``table``.
 
     ``ticks`` and ``known`` belong to the rows of ``replayed``; those without an answer in
     ``table`` are not compared, nor are fields that messages did not have when it was recorded.
@@ -403,7 +423,8 @@ def compare_tables(mine: LagTable, recorded: LagTable) -> list[Comparison]:
 def replay_controllers(
     configuration: Configuration, run: Run, table: LagTable, progress: Progress
 ) -> list[Comparison]:
-    """Return the comparison of all that the controllers answered in ``run``.
+    """
+    Return the comparison of all that the controllers answered in ``run``.
 
     Topics that are not in the bag are left out, as is the pressure controller without the
     references that it follows. ``progress`` is called with the steps done so far. Raises BagError

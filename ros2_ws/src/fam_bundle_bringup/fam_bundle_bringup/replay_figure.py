@@ -1,26 +1,38 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The figure of a replay: measured against simulated, and their difference."""
 
 from typing import Any
 
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-
 from fam_bundle_bringup.replay_controllers import Run
-from fam_bundle_bringup.replay_plant import RESTART_PERIOD, Simulated, measured
+from fam_bundle_bringup.replay_plant import measured, RESTART_PERIOD, Simulated
 from fam_bundle_io.figures_style import (
+    Array,
     KILOPASCAL,
+    legend_beside,
     MEASURED,
     PERCENT,
     SOURCE,
-    Array,
-    legend_beside,
     styled,
     unit_style,
 )
 from fam_bundle_model.parameters import seconds
 from fam_bundle_node.stamps import nanoseconds
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
 
 ONCE = {'color': '#000000', 'linestyle': '--', 'linewidth': 1.0}
 ANEW = {'color': '#882255', 'linewidth': 1.0}
@@ -29,7 +41,8 @@ BELOW = {**MEASURED, 'linewidth': 3.0}  # shows on both sides of what is simulat
 
 @styled
 def replay_figure(run: Run, simulated: Simulated) -> Figure:
-    """Return strain (%) and pressures (kPa), measured and simulated, and their differences.
+    """
+    Return strain (%) and pressures (kPa), measured and simulated, and their differences.
 
     The strain is simulated from the start and set to the measured state each second; pressures
     are shown set anew.

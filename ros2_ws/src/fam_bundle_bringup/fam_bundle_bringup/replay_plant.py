@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Recorded valve commands through the simulated plant: how far it is from what was measured.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Recorded valve commands through the simulated plant: how far it is from what was measured.
 
 Once from the start of the run to its end, and once set to the measured state each second. A
 command is held from the sample that it answers; in real time, if it was published after the next
@@ -9,13 +23,10 @@ the replay is not exact. While the plant was safe, every unit is open to the tan
 
 import bisect
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, NamedTuple
-
-import numpy as np
-import numpy.typing as npt
+from typing import NamedTuple, TYPE_CHECKING
 
 from fam_bundle_bringup.experiment import LARGEST_RUN
-from fam_bundle_bringup.replay_controllers import COMMAND, Run, Samples, per_unit, stamps_of
+from fam_bundle_bringup.replay_controllers import COMMAND, per_unit, Run, Samples, stamps_of
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_model import fam
 from fam_bundle_model.compile import direct
@@ -23,17 +34,19 @@ from fam_bundle_model.hydraulics import TO_TANK
 from fam_bundle_model.parameters import Configuration, seconds
 from fam_bundle_node.stamps import nanoseconds
 from fam_bundle_sim.plant import (
-    SOURCE_PRESSURE,
-    STRAIN,
-    STRAIN_RATE,
-    UNITS,
     Plant,
     plant,
     plant_step,
     resting_state,
+    SOURCE_PRESSURE,
+    STRAIN,
+    STRAIN_RATE,
     truth,
+    UNITS,
 )
 from fam_bundle_sim.sensors import CHANNELS, measure, sensors
+import numpy as np
+import numpy.typing as npt
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,7 +60,8 @@ SIGNAL_UNITS = {'strain': '', 'force': 'N', 'source_pressure': 'Pa', 'mu_pressur
 
 
 class Course(NamedTuple):
-    """What the plant was told, one entry for each tick of which the bag has anything.
+    """
+    What the plant was told, one entry for each tick of which the bag has anything.
 
     ``row`` is that of the sample, -1 where the bag has none. ``command`` (n, units) holds from
     there for ``periods`` steps of ``dt`` (s). ``held`` counts the samples whose answer is not in
@@ -100,7 +114,8 @@ def deviations(seen: Mapping[str, Array], simulated: Mapping[str, Array]) -> dic
 
 
 def replay_plant(configuration: Configuration, run: Run, progress: Progress) -> Simulated:
-    """Return what the plant of ``configuration`` does under the commands of ``run``.
+    """
+    Return what the plant of ``configuration`` does under the commands of ``run``.
 
     ``progress`` is called with the ticks done so far, of twice those of the run. Raises BagError
     where the bag has no commands, or stamps that do not rise.
@@ -194,7 +209,8 @@ def restart_rows(samples: Samples) -> list[int]:
 
 
 def measured_state(rig: Plant, samples: Samples, row: int, spool: Array) -> Array:
-    """Return the plant's state that fits what was measured at a sample, with the ``spool`` given.
+    """
+    Return the plant's state that fits what was measured at a sample, with the ``spool`` given.
 
     The strain rate is that of a parabola through the samples around; the oil of each unit follows
     from its pressure and the strain.
@@ -232,7 +248,8 @@ def _simulate(
     marks: list[int],
     progress: Progress,
 ) -> dict[str, Array]:
-    """Return what ideal sensors read while the plant takes its course from ``state``.
+    """
+    Return what ideal sensors read while the plant takes its course from ``state``.
 
     It is set to what was measured at the rows ``marks`` of the samples; its spools go on, for they
     follow from the commands alone.

@@ -1,21 +1,34 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The graph in real time under observation: nodes that can be hurt, and all that they said."""
 
+from collections.abc import Callable, Mapping
 import contextlib
 import gc
 import math
+from pathlib import Path
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Mapping
-from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
 
 from fam_bundle_bringup.graph import (
+    listening,
     LOOP_LISTENERS,
     NODES,
-    listening,
     nodes_in,
     own_domain,
 )
@@ -37,7 +50,8 @@ class Seen(NamedTuple):
 
 
 class Report(NamedTuple):
-    """One status from /diagnostics.
+    """
+    One status from /diagnostics.
 
     ``at`` (ns, steady) and ``at_system`` (s, system) tell when it came; ``stamp`` (s, system) is
     its own.
@@ -104,7 +118,6 @@ class Rig:
 
     def _subscribe(self, node: Any) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
-
         from fam_bundle_node.qos import REPORTS
 
         self.node = node
@@ -225,7 +238,8 @@ class Rig:
         return next((bool(s.safe) for s in states if s.steady_time < since), False)
 
     def stale_but_not_safe(self, since: int, limit: float) -> int:
-        """Return how many samples from ``since`` on (ns, steady) drove the valves on old commands.
+        """
+        Return how many samples from ``since`` on (ns, steady) drove the valves on old commands.
 
         Those that are not safe although none of the samples of the last ``limit`` s before was
         ever answered.

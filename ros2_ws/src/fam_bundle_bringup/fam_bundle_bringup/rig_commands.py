@@ -1,33 +1,46 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The commands for a rig: ``./fam doctor``, ``./fam check-channels`` and ``./fam zero``."""
 
 import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import dataclasses
 import math
+from pathlib import Path
 import shutil
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
 
-from fam_bundle_bringup.bridge_options import SIMULATED, agreed, check_backend_name
+from fam_bundle_bringup.bridge_options import agreed, check_backend_name, SIMULATED
 from fam_bundle_bringup.doctor import add_doctor_options, run_doctor, simulated_hardware
 from fam_bundle_bringup.experiment import checked_configuration, default_configuration
-from fam_bundle_io.hardware.backend import Setup, load_backend, make_setup
+from fam_bundle_io.hardware.backend import load_backend, make_setup, Setup
 from fam_bundle_io.hardware.calibration import (
-    MU_PRESSURE,
-    SOURCE_PRESSURE,
     Calibration,
     HardwareFile,
-    SensorCalibration,
     load_hardware,
+    MU_PRESSURE,
+    SensorCalibration,
+    SOURCE_PRESSURE,
     write_hardware,
 )
-from fam_bundle_io.hardware.channel_check import LOWEST_SHARE, ChannelCheck, Finding
+from fam_bundle_io.hardware.channel_check import ChannelCheck, Finding, LOWEST_SHARE
 from fam_bundle_io.hardware.monitor import Monitor, Sample
 from fam_bundle_io.hardware.safety import Refused
 from fam_bundle_io.hardware.zeroing import Zeroing
@@ -105,7 +118,8 @@ def _pressure(text: str) -> float:
 
 
 def run_rig_command(options: argparse.Namespace) -> int:
-    """Run one of the commands and return its exit status.
+    """
+    Run one of the commands and return its exit status.
 
     Raises ConfigurationError for what cannot be used, OSError and RuntimeError where the card or
     the rig does not do what it should; the card is closed by then.
@@ -134,7 +148,8 @@ class Rig(NamedTuple):
 
 
 def rig_of(options: argparse.Namespace, source: float | None = None) -> Rig:
-    """Return the rig that the options name; nothing is opened yet.
+    """
+    Return the rig that the options name; nothing is opened yet.
 
     A simulated one hangs vented, with its source at ``source`` Pa. Raises ConfigurationError.
     """
@@ -192,7 +207,8 @@ def live_line() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def opened(rig: Rig, backend: str, highest: float) -> Iterator[Monitor]:
-    """Give the monitor of an opened card; ``highest`` (Pa) is the set value of its source.
+    """
+    Give the monitor of an opened card; ``highest`` (Pa) is the set value of its source.
 
     Whatever happens meanwhile, the safe volts are out and the card is closed in the end.
     """
@@ -233,7 +249,8 @@ def run_check(options: argparse.Namespace) -> int:
 
 
 def check_rig(rig: Rig, backend: str, limit: float) -> list[Finding]:
-    """Check every motor unit at ``limit`` Pa at most, and print what is found as it is found.
+    """
+    Check every motor unit at ``limit`` Pa at most, and print what is found as it is found.
 
     Raises CheckFailed where the check cannot go on.
     """
@@ -273,7 +290,8 @@ def run_zero(options: argparse.Namespace) -> int:
 
 
 def zero_rig(rig: Rig, backend: str) -> Zeroing:
-    """Return a zeroing with its result, of a rig at rest with every unit vented.
+    """
+    Return a zeroing with its result, of a rig at rest with every unit vented.
 
     Raises RuntimeError where it cannot be zeroed.
     """

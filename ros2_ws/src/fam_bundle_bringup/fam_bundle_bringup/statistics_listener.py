@@ -1,9 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Listens to the loop statistics of every node of a domain, whatever its namespace."""
 
+from collections.abc import Callable, Iterator
 import contextlib
 import time
-from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from fam_bundle_bringup.this_machine import stay_on_this_machine
@@ -87,11 +100,10 @@ class StatisticsListener:
 @contextlib.contextmanager
 def listening(domain: int) -> Iterator[Callable[[float], list[Report]]]:
     """Give a function that listens in ``domain`` for some seconds and returns the reports."""
+    from fam_bundle_node.run import make_executor
     import rclpy
     from rclpy.signals import SignalHandlerOptions
     from rclpy.task import Future
-
-    from fam_bundle_node.run import make_executor
 
     stay_on_this_machine()
     rclpy.init(args=[], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)

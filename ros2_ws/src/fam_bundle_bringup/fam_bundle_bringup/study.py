@@ -1,17 +1,30 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The study file: which schemes, references and parameters, and the cases that they make."""
 
+from collections.abc import Iterator, Mapping, Sequence
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_bringup.study_case import RIVALS, Setting
 from fam_bundle_model.parameters import (
-    GROUPS,
     Configuration,
+    GROUPS,
     make_configuration,
     read_yaml,
 )
@@ -60,7 +73,8 @@ class Sample(NamedTuple):
 
 
 class Study(NamedTuple):
-    """A study file that has been read and checked.
+    """
+    A study file that has been read and checked.
 
     ``base`` are the values of the parameter file, ``changes`` what every case changes of them.
     The first of ``schemes`` is the one that the others are compared with.
@@ -78,7 +92,8 @@ class Study(NamedTuple):
 
 
 class Case(NamedTuple):
-    """One run: its scheme, its labels on named axes, its varied parameters by name.
+    """
+    One run: its scheme, its labels on named axes, its varied parameters by name.
 
     ``situation`` is the setting without what the scheme changes: the rivals run in it.
     Where no setting can be made of the values it is None, and ``reason`` says why.
@@ -96,7 +111,8 @@ class Case(NamedTuple):
 
 
 def read_study(path: Path) -> Study:
-    """Return the study in ``path``.
+    """
+    Return the study in ``path``.
 
     Raises ConfigurationError naming file, entry, value and bound.
     """
@@ -184,7 +200,8 @@ def _words(entry: str, content: Any, known: Sequence[str]) -> tuple[str, ...]:
 
 
 def declared(name: Any) -> Declaration:
-    """Return the declaration of the parameter 'group.parameter' or 'rig.group.parameter'.
+    """
+    Return the declaration of the parameter 'group.parameter' or 'rig.group.parameter'.
 
     Raises ConfigurationError where there is none, or where it changes no offline run.
     """
@@ -303,7 +320,8 @@ def varied(study: Study) -> list[str]:
 
 
 def sampled(sample: Sample | None) -> Iterator[Changes]:
-    """Yield the points of a Latin hypercube; one without changes where nothing is sampled.
+    """
+    Yield the points of a Latin hypercube; one without changes where nothing is sampled.
 
     Each parameter's range falls into as many parts, equal or equal in logarithm, as there are
     points, and each part holds one point: SciPy's ``qmc.LatinHypercube``. Whole numbers are

@@ -1,31 +1,43 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """One case of a study: its run offline and what is measured; and the rivals of its schemes."""
 
+from collections.abc import Callable
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from fam_bundle_bringup.experiment import check_feasible, last_cycle
 from fam_bundle_bringup.failure import RunFailed
-from fam_bundle_bringup.hindsight import THRESHOLDS, best_threshold, with_threshold
+from fam_bundle_bringup.hindsight import best_threshold, THRESHOLDS, with_threshold
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_io.energy import energy, powers, summary
 from fam_bundle_io.metrics import (
-    NotMeasurable,
-    Window,
     needless_shifts,
+    NotMeasurable,
     shift_times,
     shortest_interval,
     ticks_in,
     tracking,
+    Window,
 )
 from fam_bundle_io.trace import Trace
-from fam_bundle_model.lag_table import PHYSICS, LagTable, cached_lag_table
+from fam_bundle_model.lag_table import cached_lag_table, LagTable, PHYSICS
 from fam_bundle_model.parameters import Configuration
 from fam_bundle_model.schema import ConfigurationError
+import numpy as np
 
 Row = dict[str, Any]
 
@@ -68,7 +80,8 @@ MEASURED = (
 
 
 def measured(setting: Setting, trace: Trace) -> Row:
-    """Return the numbers of a whole run, in SI units.
+    """
+    Return the numbers of a whole run, in SI units.
 
     Tracking and energy are taken over the window of the metrics, the last cycle; shifts over the
     whole run. Raises NotMeasurable where the trace does not reach that far or is not finite.
@@ -97,7 +110,8 @@ def not_run(status: str, reason: str) -> Row:
 
 
 def run_case(setting: Setting) -> Row:
-    """Return the row of one case: ``status``, ``reason`` and what it is measured by.
+    """
+    Return the row of one case: ``status``, ``reason`` and what it is measured by.
 
     ``status`` is ``ok``; ``unreachable`` where the rig cannot do it, which is then not tried;
     ``diverged`` where the run ended early or gave nothing that can be measured.
@@ -135,7 +149,8 @@ def _lag_table(wanted: _Table) -> LagTable:
 
 
 def run_best_threshold(setting: Setting) -> Row:
-    """Return the row of the best fixed threshold for this very reference, by hindsight.
+    """
+    Return the row of the best fixed threshold for this very reference, by hindsight.
 
     ``threshold`` is the one with the least IAE among those that do not chatter, ``steady`` how
     many of those tried do not. ``unreachable`` where all do.

@@ -1,16 +1,29 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """``./fam study``: its options, its files, and what it prints."""
 
 import argparse
 import collections
+from collections.abc import Mapping, Sequence
 import contextlib
 import os
+from pathlib import Path
 import statistics
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TYPE_CHECKING
 
 from fam_bundle_bringup.experiment import prepare_folder
 from fam_bundle_bringup.progress import progress_bar
@@ -66,7 +79,8 @@ def cores() -> int:
 
 
 def run_study(options: argparse.Namespace) -> int:
-    """Run, or go on with, the study in ``options.file`` and return the exit status.
+    """
+    Run, or go on with, the study in ``options.file`` and return the exit status.
 
     Raises ConfigurationError for a bad study, StudyStopped where it cannot go on.
     """
@@ -94,7 +108,8 @@ def run_study(options: argparse.Namespace) -> int:
 def run_cases(
     study: 'Study', out: Path, workers: int, dask: str | None = None, *, as_csv: bool = False
 ) -> 'Result':
-    """Run what is not done of ``study``, write its result to the folder ``out`` and return it.
+    """
+    Run what is not done of ``study``, write its result to the folder ``out`` and return it.
 
     In so many processes, or on the Dask cluster at the address ``dask``. Raises
     ConfigurationError where nothing of it can be run, StudyStopped where it cannot go on; rows
@@ -103,9 +118,9 @@ def run_cases(
     from fam_bundle_bringup.study import cases_of
     from fam_bundle_bringup.study_result import result_of, write_result
     from fam_bundle_bringup.study_run import (
-        Journal,
         dask_cluster,
         jobs_of,
+        Journal,
         origin,
         processes,
         run_jobs,
@@ -148,7 +163,8 @@ def run_cases(
 
 
 def draw_figures(columns: Columns, provenance: Mapping[str, Any], folder: Path) -> list[Path]:
-    """Write the figures of a study as PNG and PDF and return their paths.
+    """
+    Write the figures of a study as PNG and PDF and return their paths.
 
     Those of an earlier call in ``folder`` are removed.
     """
@@ -174,7 +190,8 @@ def draw_figures(columns: Columns, provenance: Mapping[str, Any], folder: Path) 
 
 
 def heat_axes(columns: Columns, provenance: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the two axes of the heat maps, across first; none where there are no two.
+    """
+    Return the two axes of the heat maps, across first; none where there are no two.
 
     Those that the study names; else frequency and amplitude; else the first two of the grid that
     differ, or the only one and the schemes.

@@ -1,12 +1,25 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The result of a study: one row for each case with its provenance, as Parquet or CSV."""
 
+from collections.abc import Mapping, Sequence
 import csv
 import datetime
 import importlib.util
 import io
 import json
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +38,8 @@ RATIOS = ('iae', 'max_error')
 
 
 class Result(NamedTuple):
-    """Columns of one value for each case, and their provenance.
+    """
+    Columns of one value for each case, and their provenance.
 
     A number that there is not is None, a text that there is not is empty.
     """
@@ -99,7 +113,8 @@ def can_parquet() -> bool:
 
 
 def write_result(result: Result, folder: Path, as_csv: bool) -> Path:
-    """Write ``study.parquet`` or ``study.csv``, and ``study.json`` beside it, each whole.
+    """
+    Write ``study.parquet`` or ``study.csv``, and ``study.json`` beside it, each whole.
 
     The provenance is in the metadata of the Parquet file, and in ``study.json``.
     """
@@ -131,7 +146,8 @@ def _parquet(result: Result) -> bytes:
 
 
 def read_result(folder: Path) -> Result:
-    """Return the result in ``folder``, of whichever kind is there.
+    """
+    Return the result in ``folder``, of whichever kind is there.
 
     Raises ConfigurationError where there is none.
     """

@@ -1,7 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Runs the cases of a study on all cores or on a Dask cluster, and goes on where it stopped."""
 
+from collections.abc import Callable, Iterable, Iterator, Mapping
 import concurrent.futures
+from concurrent.futures import Executor
 import contextlib
 import ctypes
 import fcntl
@@ -10,16 +25,14 @@ import hashlib
 import json
 import multiprocessing
 import os
+from pathlib import Path
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Executor
-from pathlib import Path
 from typing import NamedTuple, TextIO
 
 from fam_bundle_bringup.experiment import versions
 from fam_bundle_bringup.study import Case
-from fam_bundle_bringup.study_case import RIVALS, Row, Setting, lag_table_of, not_run, run_case
+from fam_bundle_bringup.study_case import lag_table_of, not_run, RIVALS, Row, run_case, Setting
 from fam_bundle_model.compile import COMPILED_PACKAGES, source_digest
 from fam_bundle_model.lag_table import PHYSICS
 from fam_bundle_model.schema import ConfigurationError
@@ -34,7 +47,8 @@ class StudyStopped(RuntimeError):
 
 
 class Job(NamedTuple):
-    """Runs that give one row: a case, or a rival in a situation; ``runs`` is how many.
+    """
+    Runs that give one row: a case, or a rival in a situation; ``runs`` is how many.
 
     ``key`` is that of the row, ``origin`` what the worker's sources must be.
     """
@@ -157,7 +171,8 @@ def processes(workers: int) -> Iterator[Executor]:
 
 @contextlib.contextmanager
 def dask_cluster(address: str) -> Iterator[Executor]:
-    """Give an executor of the Dask cluster whose scheduler is at ``address``.
+    """
+    Give an executor of the Dask cluster whose scheduler is at ``address``.
 
     Raises ConfigurationError where there is none, or none can be used.
     """
@@ -203,7 +218,8 @@ class Journal:
     """The rows of a folder that are done, one JSON object a line, each kept at once."""
 
     def __init__(self, path: Path) -> None:
-        """Read the rows in ``path``, if there are any, and keep others away from it.
+        """
+        Read the rows in ``path``, if there are any, and keep others away from it.
 
         Raises ConfigurationError where another study runs there.
         """
@@ -250,7 +266,8 @@ def run_jobs(
     executor: Executor,
     progress: Callable[[int], None],
 ) -> None:
-    """Run the ``jobs`` whose rows ``journal`` lacks; ``progress`` gets the runs done of all.
+    """
+    Run the ``jobs`` whose rows ``journal`` lacks; ``progress`` gets the runs done of all.
 
     First one for each number of motor units, which compiles the laws, then each lag table once,
     so that no two workers do the same. Raises StudyStopped where a worker dies.

@@ -1,16 +1,29 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What can go wrong around the nodes: the system's clock, the middleware's shared memory."""
 
+from collections.abc import Mapping
 import os
+from pathlib import Path
 import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
-from pathlib import Path
 
 from fam_bundle_bringup.rig import PACKAGES, Rig
-from fam_bundle_bringup.verdicts import AFTER, HARMLESS, Fault, both, harmless_or_safe
+from fam_bundle_bringup.verdicts import AFTER, both, Fault, HARMLESS, harmless_or_safe
 
 COMPILERS = ('cc', 'gcc', 'clang')
 LEASE = 25.0  # s; after 20 the middleware forgets who was not heard of
@@ -152,7 +165,8 @@ def set_offset(offset: Path, seconds: int) -> None:
 
 
 def with_own_clock(offset: Path, folder: Path) -> Mapping[str, str]:
-    """Return the environment in which a process adds what is in ``offset`` to its clock.
+    """
+    Return the environment in which a process adds what is in ``offset`` to its clock.
 
     Raises RuntimeError without a C compiler.
     """
@@ -172,7 +186,8 @@ def with_own_clock(offset: Path, folder: Path) -> Mapping[str, str]:
 
 
 def without_shared_memory(name: str) -> Fault:
-    """Return the fault that one node has shared memory of its own, in a mount namespace.
+    """
+    Return the fault that one node has shared memory of its own, in a mount namespace.
 
     Nothing uses any: that is asked of all nodes, for a process that is killed while it holds a
     lock there holds the others up.

@@ -1,23 +1,35 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """``./fam top``: how every node keeps up, as a live view or, without a terminal, as lines."""
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
 import contextlib
+from datetime import datetime
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from datetime import datetime
 from typing import NamedTuple
 
+from fam_bundle_bringup.domain_marker import chosen_domain
+from fam_bundle_bringup.statistics_listener import listening, Report
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
 from rich.measure import Measurement
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
-
-from fam_bundle_bringup.domain_marker import chosen_domain
-from fam_bundle_bringup.statistics_listener import Report, listening
 
 SILENT = 3.0  # s without a report
 REDRAW = 0.5  # s
@@ -208,7 +220,8 @@ def _state(report: Report, silence: float | None) -> Text:
 
 
 def run_top(asked: int | None, seconds: float) -> None:
-    """Show the nodes of the domain ``asked``, or of the one found, for ``seconds``.
+    """
+    Show the nodes of the domain ``asked``, or of the one found, for ``seconds``.
 
     Ctrl-C ends it before. Raises ConfigurationError when it cannot be known which domain.
     """

@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What is asked of the loop after a fault: observations in words, each with a verdict."""
 
 from collections.abc import Callable
@@ -48,7 +61,8 @@ def goes_on(rig: Rig) -> tuple[str, bool]:
 
 
 def first_bump(rig: Rig, tick: int) -> float:
-    """Return how far the first applied reference from ``tick`` on is from the pressure (Pa).
+    """
+    Return how far the first applied reference from ``tick`` on is from the pressure (Pa).
 
     That is the pressure of its sample or of the last one answered before, at which the law was
     kept until then: a unit that is being vented loses some percent in a millisecond. The law's
@@ -74,7 +88,8 @@ def both(*found: tuple[str, bool]) -> tuple[str, bool]:
 
 
 def harmless_or_safe(rig: Rig, since: int, seconds: float = AFTER) -> tuple[str, bool]:
-    """Return whether for a while nothing happened, or the plant was safe while it had to be.
+    """
+    Return whether for a while nothing happened, or the plant was safe while it had to be.
 
     A process that comes or goes costs the others time in the middleware and on the cores.
     """

@@ -1,19 +1,32 @@
-# SPDX-License-Identifier: Apache-2.0
-"""What each recruited motor unit is asked for (``docs/recruitment.md``, Allocation).
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What each recruited motor unit is asked for (``docs/recruitment.md``, Allocation).
 
 ``batch`` is the paper's: all recruited units follow one pressure reference. The other two are
 ours. There the strain loop's output is the pressure that all units of the bundle *would* need in
 common, which names a force whatever is recruited, and that force is shared out by the model.
 """
 
-import numpy as np
-import numpy.typing as npt
-
 from fam_bundle_model import fam
 from fam_bundle_model.bundle import MotorUnit
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.parameters import ALLOCATIONS
 from fam_bundle_model.pressure_pi import clamp
+import numpy as np
+import numpy.typing as npt
 
 BATCH, FORCE, ORDERLY = range(len(ALLOCATIONS))
 READY = 0.9  # of its pressure to be: a unit that fills is counted as measured up to there
@@ -21,7 +34,8 @@ READY = 0.9  # of its pressure to be: a unit that fills is counted as measured u
 
 @compiled
 def is_compensated(unit: int, recruited: int) -> bool:
-    """Return whether ``unit`` gets the pressure compensation: those before the newest recruit.
+    """
+    Return whether ``unit`` gets the pressure compensation: those before the newest recruit.
 
     A single recruited unit is compensated against the slack ones itself.
     """
@@ -32,7 +46,8 @@ def is_compensated(unit: int, recruited: int) -> bool:
 def common_pressure(
     units: tuple[MotorUnit, ...], first: int, last: int, force: float, strain: float
 ) -> float:
-    """Return the pressure in Pa at which units ``first`` to ``last - 1``, taut, hold ``force`` N.
+    """
+    Return the pressure in Pa at which units ``first`` to ``last - 1``, taut, hold ``force`` N.
 
     The inverse of equations 1 and 2, which are linear in pressure. Zero where their braids cannot
     pull at this strain.
@@ -79,7 +94,8 @@ def balance(
     strain: float,
     mu_pressure: npt.NDArray[np.float64],
 ) -> float:
-    """Return the pressure in Pa at which the full ones of the ``older`` units hold ``force`` N.
+    """
+    Return the pressure in Pa at which the full ones of the ``older`` units hold ``force`` N.
 
     Those that still fill, below ``ready`` (Pa) or slack, give what they are measured to give. The
     first is full.
@@ -109,7 +125,8 @@ def allocate(
     mu_pressure: npt.NDArray[np.float64],
     references: npt.NDArray[np.float64],
 ) -> None:
-    """Fill ``references`` (units,), the pressure in Pa that each unit shall have; vented ones 0.
+    """
+    Fill ``references`` (units,), the pressure in Pa that each unit shall have; vented ones 0.
 
     ``batch``: the pressure reference, for the units before the newest with the compensation
     (equation 11) on top, none above the source pressure.

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""From which tick on an announced trajectory counts, however early or late its news comes.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+From which tick on an announced trajectory counts, however early or late its news comes.
 
 The strain controller tracks a new trajectory from the tick after its stamp on. Whoever predicts
 with it may have answered that tick before the news comes. So there it counts a fixed notice later,
@@ -38,7 +52,8 @@ class Announced:
         self._waiting = deque(w for w in self._waiting if w.since == BEGINNING)
 
     def add(self, news: Announcement) -> int:
-        """Take news; return by how much its ticks were missed, 0 where that changes nothing.
+        """
+        Take news; return by how much its ticks were missed, 0 where that changes nothing.
 
         Those announced before it for a later time are of an earlier run, and are dropped.
         """

@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """First-order low-pass filters, alone and four in a row."""
 
 from typing import NamedTuple
@@ -38,7 +51,8 @@ def cascade_step(state: Cascade, value: float, time_constant: float, dt: float) 
 
 @compiled
 def cascade_derivatives(state: Cascade, time_constant: float) -> tuple[float, float, float]:
-    """Return the first three derivatives of the last output, per s, s^2 and s^3.
+    """
+    Return the first three derivatives of the last output, per s, s^2 and s^3.
 
     A backward Euler filter's input less its output, over its time constant, is the backward
     difference of its output: no difference of the noisy input is taken.

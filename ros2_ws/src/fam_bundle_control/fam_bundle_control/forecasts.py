@@ -1,19 +1,32 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What was expected for now, some time ago: the measure of a predictor."""
 
 from typing import NamedTuple
 
+from fam_bundle_model.compile import compiled
 import numpy as np
 import numpy.typing as npt
-
-from fam_bundle_model.compile import compiled
 
 ROWS = 512
 KEPT = 500  # rows that a horizon fills at most; where it has more ticks some are left out
 
 
 class Forecasts(NamedTuple):
-    """A ring of expectations; each row: the time at which it was made (s), and its columns.
+    """
+    A ring of expectations; each row: the time at which it was made (s), and its columns.
 
     ``oldest`` and ``newest`` count the rows that were ever written. ``clock`` is the time since
     the start in s.
@@ -59,7 +72,8 @@ def due(state: Forecasts, column: int, horizon: float) -> float:
 
 @compiled
 def next_row(state: Forecasts, horizon: float) -> tuple[Forecasts, int]:
-    """Return the ring with a row for this tick, and its number; -1 where none is wanted.
+    """
+    Return the ring with a row for this tick, and its number; -1 where none is wanted.
 
     The row is written in place.
     """

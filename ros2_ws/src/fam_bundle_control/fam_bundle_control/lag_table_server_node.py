@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """ROS node that builds, keeps and serves the lag table: a latched topic and three services."""
 
 import dataclasses
@@ -7,11 +20,11 @@ import time
 from typing import Any
 
 from fam_bundle_model.lag_table import (
-    PHYSICS,
     build_lag_table,
     cached_lag_table,
     lag_table_hash,
     look_up,
+    PHYSICS,
 )
 from fam_bundle_model.parameters import LagTableParameters
 from fam_bundle_model.schema import ConfigurationError, make_group

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The expected trajectory E(t) of equation 14, by one of four predictors.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The expected trajectory E(t) of equation 14, by one of four predictors.
 
 - constant rate: the measured strain goes on at its filtered rate (the paper's);
 - constant acceleration: a parabola, its acceleration over the next ``REACH`` only;
@@ -22,8 +36,8 @@ from fam_bundle_control.filters import (
     resting_cascade,
 )
 from fam_bundle_control.forecasts import (
-    Forecasts,
     due,
+    Forecasts,
     forecasts_start,
     forecasts_step,
     is_due,
@@ -36,7 +50,7 @@ from fam_bundle_control.sinusoid import (
     sinusoid_step,
 )
 from fam_bundle_model.compile import compiled
-from fam_bundle_model.parameters import PREDICTORS, Configuration
+from fam_bundle_model.parameters import Configuration, PREDICTORS
 from fam_bundle_model.reference import Reference, strain_reference
 
 CONSTANT_RATE, CONSTANT_ACCELERATION, SINUSOID, PREVIEW = range(len(PREDICTORS))
@@ -53,7 +67,8 @@ EXPECTED, SIMPLY, MODELLED = range(3)  # columns of the forecasts
 
 
 class Predictor(NamedTuple):
-    """Settings: which one, filter of the strain rate in s, rate in 1/s below which nothing moves.
+    """
+    Settings: which one, filter of the strain rate in s, rate in 1/s below which nothing moves.
 
     ``horizon`` (s) is how far ahead its error is measured.
     """
@@ -65,7 +80,8 @@ class Predictor(NamedTuple):
 
 
 class PredictorState(NamedTuple):
-    """What is remembered: the last strain, its filtered rate in 1/s, and what the models know.
+    """
+    What is remembered: the last strain, its filtered rate in 1/s, and what the models know.
 
     ``time`` is that of the last tick in s, ``position`` the strain without noise, ``velocity``
     and ``acceleration`` its derivatives, ``weight`` that of the model against the constant rate
@@ -90,7 +106,8 @@ class PredictorState(NamedTuple):
 
 
 class Course(NamedTuple):
-    """The way ahead: what of a state it follows from; numbers only, to be looked at often.
+    """
+    The way ahead: what of a state it follows from; numbers only, to be looked at often.
 
     ``reference`` is the reference strain now.
     """
@@ -108,7 +125,8 @@ class Course(NamedTuple):
 
 
 def predictor(configuration: Configuration, *, live: bool | None = None) -> Predictor:
-    """Return the predictor of ``configuration``; a ``live`` reference has no preview.
+    """
+    Return the predictor of ``configuration``; a ``live`` reference has no preview.
 
     Unless it is told otherwise the reference is the configured one.
     """
@@ -154,7 +172,8 @@ def predictor_step(
     strain: float,
     dt: float,
 ) -> PredictorState:
-    """Return the next state from one tick's measured strain; ``time`` and ``dt`` in s.
+    """
+    Return the next state from one tick's measured strain; ``time`` and ``dt`` in s.
 
     The forecasts are written in place.
     """
@@ -243,7 +262,8 @@ def course_of(law: Predictor, state: PredictorState, reference: Reference) -> Co
 
 @compiled
 def simply_expected(course: Course, ahead: float) -> float:
-    """Return the strain ``ahead`` s from now without a model, at constant rate.
+    """
+    Return the strain ``ahead`` s from now without a model, at constant rate.
 
     Where the reference is known it tells the rate: the strain stands still without it.
     """
@@ -252,7 +272,8 @@ def simply_expected(course: Course, ahead: float) -> float:
 
 @compiled
 def modelled(course: Course, then: float, ahead: float) -> float:
-    """Return the strain ``ahead`` s from now by the reference, the parabola or the sinusoid.
+    """
+    Return the strain ``ahead`` s from now by the reference, the parabola or the sinusoid.
 
     ``then`` is the reference strain at that time. At constant rate there is nothing to learn of
     it: a preview that takes over begins without prejudice.
@@ -305,7 +326,8 @@ def may_fall(law: Predictor, state: PredictorState) -> bool:
 def time_to_rise(
     law: Predictor, state: PredictorState, reference: Reference, target: float
 ) -> float:
-    """Return the time in s until the strain is expected to rise to ``target``: equation 15.
+    """
+    Return the time in s until the strain is expected to rise to ``target``: equation 15.
 
     The first time at which it is there or above, and rising. Negative where it is now: by its
     present rate, when it passed. Infinite where it is not expected to within ``FAR``.
@@ -321,7 +343,8 @@ def time_to_rise(
 def time_to_fall(
     law: Predictor, state: PredictorState, reference: Reference, target: float
 ) -> float:
-    """Return the time in s until the strain is expected to fall to ``target``: equation 16.
+    """
+    Return the time in s until the strain is expected to fall to ``target``: equation 16.
 
     The mirror image of ``time_to_rise``.
     """
@@ -336,7 +359,8 @@ def time_to_fall(
 def stays_above(
     law: Predictor, state: PredictorState, reference: Reference, target: float, ahead: float
 ) -> bool:
-    """Return whether the strain is above ``target`` still, ``ahead`` s from now.
+    """
+    Return whether the strain is above ``target`` still, ``ahead`` s from now.
 
     For a trajectory that has risen to it by then; one at constant rate does not come back.
     """

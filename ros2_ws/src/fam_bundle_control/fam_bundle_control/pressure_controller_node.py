@@ -1,11 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """ROS node of the inner loops: three topics of one tick in, valve_command out."""
 
-import sys
 from collections.abc import Callable
+import sys
 from typing import Any
-
-import numpy as np
 
 from fam_bundle_control.pressure_loop import pressure_loop, pressure_loop_step
 from fam_bundle_model.bundle import motor_units
@@ -15,6 +26,7 @@ from fam_bundle_msgs.msg import BundleState, PressureReference, RecruitmentState
 from fam_bundle_node.loop_node import Controller
 from fam_bundle_node.run import run_node
 from fam_bundle_node.ticks import TickJoin
+import numpy as np
 
 TOPICS = ('bundle_state', 'pressure_reference', 'recruitment_state')
 

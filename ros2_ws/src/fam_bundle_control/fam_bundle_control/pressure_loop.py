@@ -1,20 +1,33 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The inner loops: one PI per motor unit, its output the spool command (Figures 3 and 5, b, c)."""
 
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
-from fam_bundle_control.allocation import BATCH, allocate
+from fam_bundle_control.allocation import allocate, BATCH
 from fam_bundle_model.bundle import MotorUnit
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.parameters import ALLOCATIONS, Configuration
-from fam_bundle_model.pressure_pi import PressureGains, clamp, pressure_gains, pressure_pi
+from fam_bundle_model.pressure_pi import clamp, pressure_gains, pressure_pi, PressureGains
+import numpy as np
+import numpy.typing as npt
 
 
 class PressureLoop(NamedTuple):
-    """Gains of each motor unit, how the demand is allocated (see ``allocation``), and its limit.
+    """
+    Gains of each motor unit, how the demand is allocated (see ``allocation``), and its limit.
 
     Each unit has its own gains: its loop is the faster, the less oil it holds.
     """
@@ -49,7 +62,8 @@ def pressure_loop_step(
     spool: npt.NDArray[np.float64],
     saturated: npt.NDArray[np.bool_],
 ) -> None:
-    """Update ``integral`` and fill ``references`` (Pa), ``spool`` and ``saturated``, all (units,).
+    """
+    Update ``integral`` and fill ``references`` (Pa), ``spool`` and ``saturated``, all (units,).
 
     Recruited units follow what they are allocated of the pressure reference. The others are
     vented: reference zero and no integral share, so that a unit is recruited without a bump.

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""When to recruit and when to release a motor unit, and what to add meanwhile.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+When to recruit and when to release a motor unit, and what to add meanwhile.
 
 Threshold recruitment is the paper's Figure 4; anticipatory recruitment its equations 12-16 and
 Figure 8; pressure compensation its equations 9-11. The two switches are independent. All
@@ -11,37 +25,37 @@ The paper leaves the anticipatory downshift open; ``docs/recruitment.md`` argues
 import math
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from fam_bundle_control.allocation import BATCH, is_compensated
 from fam_bundle_control.filters import filtered
 from fam_bundle_control.predictors import (
-    Predictor,
-    PredictorState,
     may_fall,
     may_rise,
+    Predictor,
     predictor,
     predictor_start,
     predictor_step,
+    PredictorState,
     stays_above,
     time_to_fall,
     time_to_rise,
 )
 from fam_bundle_model import fam
-from fam_bundle_model.bundle import MotorUnit, modelled_strain
+from fam_bundle_model.bundle import modelled_strain, MotorUnit
 from fam_bundle_model.compile import compiled
-from fam_bundle_model.hydraulics import HydraulicLaw, hydraulic_law, line_loss
+from fam_bundle_model.hydraulics import hydraulic_law, HydraulicLaw, line_loss
 from fam_bundle_model.lag_table import LagTable, look_up
 from fam_bundle_model.parameters import ALLOCATIONS, Configuration
 from fam_bundle_model.reference import Reference
+import numpy as np
+import numpy.typing as npt
 
 TAUT_SHARE = 0.05  # of the measured force; less is not told from noise
 SATURATED = 0.97  # of the source pressure: a unit there has no more to give
 
 
 class Recruitment(NamedTuple):
-    """Settings of the recruitment law; pressures in Pa, times in s.
+    """
+    Settings of the recruitment law; pressures in Pa, times in s.
 
     ``hold_all`` keeps every unit recruited. ``by_force`` is our allocation: predictions then
     reckon with what the recruited units' own flow loses on its way from the source, and a release
@@ -62,7 +76,8 @@ class Recruitment(NamedTuple):
 
 
 class RecruitmentState(NamedTuple):
-    """What the law remembers: units recruited, filters, time in the state, downshift armed.
+    """
+    What the law remembers: units recruited, filters, time in the state, downshift armed.
 
     ``below`` is for how long, in s, a release has been called for.
     """
@@ -110,7 +125,8 @@ def recruitment(configuration: Configuration, *, live: bool | None = None) -> Re
 
 
 def recruitment_start() -> RecruitmentState:
-    """Return the state before the first tick, which finds the recruited units by pressure.
+    """
+    Return the state before the first tick, which finds the recruited units by pressure.
 
     Each run needs its own: the law writes in the predictor's forecasts.
     """
@@ -124,7 +140,8 @@ def compensating_pressure(
     mu_pressure: npt.NDArray[np.float64],
     strain: float,
 ) -> float:
-    """Return P_comp in Pa of equations 10 and 11 at the measured pressures and strain.
+    """
+    Return P_comp in Pa of equations 10 and 11 at the measured pressures and strain.
 
     The resistance of every unit below its de-slack pressure, over the force per pressure of the
     compensated units that are above theirs. Zero where none is slack, or none could help.
@@ -147,7 +164,8 @@ def taut_units(
     strain: float,
     force: float,
 ) -> int:
-    """Return how many units in a row, from the first on, are taut and carry of the ``force`` (N).
+    """
+    Return how many units in a row, from the first on, are taut and carry of the ``force`` (N).
 
     By their pressure, for below strain zero an empty FAM carries by its bladder. At least 1. So a
     supervisor that joins a running loop goes on with what is recruited.
@@ -185,7 +203,8 @@ def attainable_pressure(
     strain: float,
     rate: float,
 ) -> float:
-    """Return the pressure in Pa that the recruited units can hold: equation 13 and what it omits.
+    """
+    Return the pressure in Pa that the recruited units can hold: equation 13 and what it omits.
 
     ``drop`` and ``compensation`` are the margin of equation 12. The paper leaves out what the
     units' own flow loses between source and muscle while the bundle moves at ``rate`` (1/s);
@@ -215,7 +234,8 @@ def recruitment_step(
     mu_pressure: npt.NDArray[np.float64],
     dt: float,
 ) -> tuple[RecruitmentState, RecruitmentOutput]:
-    """Return the next state and the output from one tick's measurements; SI units.
+    """
+    Return the next state and the output from one tick's measurements; SI units.
 
     ``mu_pressure`` holds each unit's pressure in recruitment order; ``time`` is that of the
     measurement, for ``reference``.

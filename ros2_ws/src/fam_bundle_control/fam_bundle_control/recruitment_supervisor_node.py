@@ -1,11 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """ROS node that decides the recruitment state: bundle_state in, recruitment_state out."""
 
 import sys
 
-import numpy as np
-
-from fam_bundle_control.announced import BEGINNING, NOTICE, Announced, Announcement
+from fam_bundle_control.announced import Announced, Announcement, BEGINNING, NOTICE
 from fam_bundle_control.recruitment import (
     recruitment,
     recruitment_start,
@@ -14,7 +25,7 @@ from fam_bundle_control.recruitment import (
 from fam_bundle_control.trajectory import FROM_OUTSIDE, LIVE
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.compile import direct
-from fam_bundle_model.lag_table import PHYSICS, LagTable, lag_table_hash
+from fam_bundle_model.lag_table import lag_table_hash, LagTable, PHYSICS
 from fam_bundle_model.parameters import seconds
 from fam_bundle_model.reference import reference_law
 from fam_bundle_msgs.msg import BundleState, RecruitmentState
@@ -25,6 +36,7 @@ from fam_bundle_node.loop_node import Controller
 from fam_bundle_node.qos import CHANGES, LATCHED
 from fam_bundle_node.run import run_node
 from fam_bundle_node.stamps import nanoseconds
+import numpy as np
 
 
 class RecruitmentSupervisor(Controller):

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""An unknown sinusoid with an offset, followed as it goes on: its frequency and its phase.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+An unknown sinusoid with an offset, followed as it goes on: its frequency and its phase.
 
 For ``x = c + A sin(w t + p)`` the third derivative is ``-w^2`` times the first, whatever c, A and
 p are. Both are taken from a cascade of low-pass filters, and w^2 is their least-squares quotient
@@ -25,7 +39,8 @@ SLOWEST, FASTEST = 2.0 * math.pi * 0.01, 2.0 * math.pi * 1.0  # rad/s
 
 
 class Sinusoid(NamedTuple):
-    """What is known of it: filters, least squares, and now its derivatives and frequency.
+    """
+    What is known of it: filters, least squares, and now its derivatives and frequency.
 
     ``velocity`` (1/s) and ``acceleration`` (1/s^2) are those of the strain at the last tick,
     ``frequency`` is in rad/s.

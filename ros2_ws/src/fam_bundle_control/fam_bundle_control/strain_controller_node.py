@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """ROS node of the outer loop: bundle_state in, pressure_reference out."""
 
 import functools
@@ -6,13 +19,9 @@ import sys
 import time
 from typing import Any
 
-import numpy as np
 from builtin_interfaces.msg import Time
-from rclpy.action import CancelResponse, GoalResponse
-from rclpy.action.server import ServerGoalHandle
-
 from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
-from fam_bundle_control.trajectory import RETURN, Score, Trajectory, goal_parameters
+from fam_bundle_control.trajectory import goal_parameters, RETURN, Score, Trajectory
 from fam_bundle_model.bundle import motor_units, reachable
 from fam_bundle_model.compile import direct
 from fam_bundle_model.parameters import ReferenceParameters, seconds
@@ -27,6 +36,9 @@ from fam_bundle_node.reference_message import to_message
 from fam_bundle_node.run import run_node
 from fam_bundle_node.stamps import nanoseconds
 from fam_bundle_node.ticked_action import TickedAction
+import numpy as np
+from rclpy.action import CancelResponse, GoalResponse
+from rclpy.action.server import ServerGoalHandle
 
 GOAL_FIELDS = tuple(declarations(ReferenceParameters))
 FEEDBACK_PERIOD = 0.05  # s of the run

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The outer loop: PI on strain, its output the pressure reference (Figure 3a).
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The outer loop: PI on strain, its output the pressure reference (Figure 3a).
 
 Where the demand is allocated by force, the output is the pressure that all units of the bundle
 would need in common, and what the model knows of it is fed forward: the pressure that balances the
@@ -8,18 +22,18 @@ load at the reference strain.
 
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from fam_bundle_control.allocation import BATCH, common_pressure, measured_force
 from fam_bundle_model.bundle import MotorUnit
 from fam_bundle_model.compile import compiled
-from fam_bundle_model.parameters import ALLOCATIONS, GRAVITY, Configuration
+from fam_bundle_model.parameters import ALLOCATIONS, Configuration, GRAVITY
 from fam_bundle_model.pressure_pi import clamp
+import numpy as np
+import numpy.typing as npt
 
 
 class StrainLoop(NamedTuple):
-    """Gains in Pa and Pa/s per unit strain, tracking time in s, nominal pressure in Pa.
+    """
+    Gains in Pa and Pa/s per unit strain, tracking time in s, nominal pressure in Pa.
 
     ``feedforward`` is the share of the balancing pressure under ``weight`` (N) that is fed
     forward, where ``by_force`` says that the demand is allocated by force.
@@ -79,7 +93,8 @@ def strain_loop_step(
     mu_pressure: npt.NDArray[np.float64],
     dt: float,
 ) -> tuple[StrainLoopState, StrainLoopOutput]:
-    """Return the next state and the output; pressures in Pa, ``dt`` in s.
+    """
+    Return the next state and the output; pressures in Pa, ``dt`` in s.
 
     The output is limited to what the source can give. Anti-windup by back-calculation over the
     tracking time. The first call starts from the measured pressure of the first motor unit, or

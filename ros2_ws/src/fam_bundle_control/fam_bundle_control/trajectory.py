@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Which reference is tracked: the configured one, live values, a goal, or what comes after it."""
 
 from collections.abc import Mapping
@@ -6,15 +19,15 @@ from typing import Any
 
 from fam_bundle_model.bundle import check_within_reach
 from fam_bundle_model.parameters import (
-    Configuration,
-    ReferenceParameters,
     check_period,
     check_reference,
+    Configuration,
+    ReferenceParameters,
 )
 from fam_bundle_model.reference import (
-    Reference,
     after,
     braked,
+    Reference,
     reference_law,
     slewed,
     still,
@@ -30,7 +43,8 @@ FROM_OUTSIDE = (LIVE, GOAL, RETURN, HOLD)  # kinds of trajectory that no paramet
 def goal_parameters(
     configured: ReferenceParameters, goal: Mapping[str, Any], period: float
 ) -> ReferenceParameters:
-    """Return the parameters of a ``goal``: those of its fields that are not zero or empty.
+    """
+    Return the parameters of a ``goal``: those of its fields that are not zero or empty.
 
     ``period`` is that of the ticks in s. Raises ConfigurationError where they are bad, do not fit
     together, or would take too long to check between two ticks.
@@ -56,7 +70,8 @@ def goal_parameters(
 
 
 class Trajectory:
-    """The reference at present; times are those of the run in s.
+    """
+    The reference at present; times are those of the run in s.
 
     ``law`` is the trajectory and ``kind`` its name; ``busy`` tells that a goal is under way.
     """
@@ -73,7 +88,8 @@ class Trajectory:
         self.busy = False
 
     def begin(self) -> bool:
-        """Go back to the configured reference for a new run; return whether that is a change.
+        """
+        Go back to the configured reference for a new run; return whether that is a change.
 
         The last live value stays.
         """
@@ -95,7 +111,8 @@ class Trajectory:
         return ''
 
     def plan(self, goal: ReferenceParameters, time: float) -> Reference:
-        """Return the trajectory to and along ``goal`` from ``time`` on.
+        """
+        Return the trajectory to and along ``goal`` from ``time`` on.
 
         Raises ConfigurationError where it leaves what the bundle can reach, or one is under way.
         """

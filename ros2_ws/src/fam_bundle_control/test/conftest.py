@@ -1,11 +1,21 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The shipped bundle, and laws and lag tables that the tests choose themselves."""
 
 import dataclasses
 from pathlib import Path
-
-import numpy as np
-import pytest
 
 from fam_bundle_control.recruitment import (
     Recruitment,
@@ -17,6 +27,8 @@ from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.lag_table import LagTable
 from fam_bundle_model.parameters import load_configuration
 from fam_bundle_model.reference import still
+import numpy as np
+import pytest
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 DT = 0.001

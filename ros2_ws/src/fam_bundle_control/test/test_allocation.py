@@ -1,19 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What each unit is asked for: force balances, limits, starts without a bump."""
 
 import dataclasses
 
-import numpy as np
-import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
-
 from fam_bundle_control.allocation import (
+    allocate,
     BATCH,
+    common_pressure,
     FORCE,
     ORDERLY,
-    allocate,
-    common_pressure,
     taut_force,
 )
 from fam_bundle_control.recruitment import attainable_pressure, recruitment
@@ -22,6 +30,10 @@ from fam_bundle_model import fam
 from fam_bundle_model.bundle import bundle_force, motor_units
 from fam_bundle_model.hydraulics import hydraulic_law, line_loss, unit_flow
 from fam_bundle_model.parameters import AllocationParameters
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
 
 NOMINAL = 689.5e3
 STRAINS = st.floats(0.0, 0.13)
@@ -68,7 +80,8 @@ def test_batch_is_the_paper(bundle):
 def test_the_recruited_units_give_the_force_demanded(
     bundle, policy, strain, share, recruited, left
 ):
-    """Whatever is recruited, the bundle has the force of all units at the pressure demanded.
+    """
+    Whatever is recruited, the bundle has the force of all units at the pressure demanded.
 
     The demand is a share of what the recruited units can do. A released unit that still holds
     pressure is reckoned with.

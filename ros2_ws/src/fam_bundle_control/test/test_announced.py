@@ -1,14 +1,26 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Which trajectory counts at a tick does not depend on when its news came, if it came in time."""
 
 import itertools
 
-import pytest
+from fam_bundle_control.announced import Announced, Announcement, BEGINNING, NOTICE
+from fam_bundle_model.reference import still
 from hypothesis import given
 from hypothesis import strategies as st
-
-from fam_bundle_control.announced import BEGINNING, NOTICE, Announced, Announcement
-from fam_bundle_model.reference import still
+import pytest
 
 TICK = 1_000_000  # ns
 FIRST = Announcement(BEGINNING, still(0.0), live=False)

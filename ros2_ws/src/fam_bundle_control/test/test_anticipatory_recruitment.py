@@ -1,17 +1,25 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Anticipatory recruitment (equations 12-16, Figure 8): shift when the lag is all that is left."""
 
 import math
 
-import numpy as np
-import pytest
-from scipy.optimize import brentq
-from scipy.signal import lfilter
-
 from fam_bundle_control.predictors import (
     CONSTANT_RATE,
-    Predictor,
     expected_strain,
+    Predictor,
     predictor_start,
     time_to_fall,
     time_to_rise,
@@ -19,6 +27,10 @@ from fam_bundle_control.predictors import (
 from fam_bundle_control.recruitment import recruitment_start, recruitment_step
 from fam_bundle_model import fam
 from fam_bundle_model.reference import still
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.signal import lfilter
 
 DT = 0.001
 STILL = still()

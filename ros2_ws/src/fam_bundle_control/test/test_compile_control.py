@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Compiled and interpreted controllers give the same bits over a run of random measurements.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Compiled and interpreted controllers give the same bits over a run of random measurements.
 
 This file runs itself a second time with FAM_BUNDLE_INTERPRET=1 and compares every number.
 """
@@ -7,11 +21,9 @@ This file runs itself a second time with FAM_BUNDLE_INTERPRET=1 and compares eve
 import dataclasses
 import json
 import os
+from pathlib import Path
 import subprocess
 import sys
-from pathlib import Path
-
-import numpy as np
 
 from fam_bundle_control.pressure_loop import pressure_loop, pressure_loop_step
 from fam_bundle_control.recruitment import recruitment, recruitment_start, recruitment_step
@@ -19,8 +31,9 @@ from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strai
 from fam_bundle_model import compile
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.lag_table import LagTable
-from fam_bundle_model.parameters import ALLOCATIONS, AllocationParameters, load_configuration
+from fam_bundle_model.parameters import AllocationParameters, ALLOCATIONS, load_configuration
 from fam_bundle_model.reference import still
+import numpy as np
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 

@@ -1,18 +1,30 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """One to sixteen motor units: recruited one after the other, released in reverse."""
 
 import dataclasses
 
-import numpy as np
-import pytest
-
 from fam_bundle_control.allocation import BATCH
 from fam_bundle_control.predictors import predictor_start
-from fam_bundle_control.pressure_loop import PressureLoop, pressure_loop_step
+from fam_bundle_control.pressure_loop import pressure_loop_step, PressureLoop
 from fam_bundle_control.recruitment import recruitment_start, recruitment_step
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.pressure_pi import PressureGains
 from fam_bundle_model.reference import still
+import numpy as np
+import pytest
 
 DT = 0.001
 STILL = still()

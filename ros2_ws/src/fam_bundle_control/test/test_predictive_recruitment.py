@@ -1,13 +1,25 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Shifts where the strain is expected to turn: what constant rate cannot see."""
 
 import math
 
-import numpy as np
-import pytest
-
 from fam_bundle_control.predictors import CONSTANT_RATE, SINUSOID
 from fam_bundle_model.bundle import modelled_strain
+import numpy as np
+import pytest
 
 DT, LAG = 0.001, 0.5
 SPEED = 2.0 * math.pi * 0.3  # rad/s
@@ -16,7 +28,8 @@ FORCE, SOURCE = 180.0, 650e3
 
 @pytest.fixture
 def swinging(supervise, law, constant_table, units):
-    """Return a maker of a supervisor before the end of a swing of the strain about its limit.
+    """
+    Return a maker of a supervisor before the end of a swing of the strain about its limit.
 
     Of two units the first is recruited, or both; what the first can hold stands ``above`` the
     middle of the swing, over its amplitude. The swing ends at ``phase`` (rad; 0 on the way up),

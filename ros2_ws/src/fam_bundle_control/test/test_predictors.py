@@ -1,37 +1,49 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What is expected of the strain, by each predictor, on motions whose future is known."""
 
 import dataclasses
 import math
 
-import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.optimize import brentq
-
 from fam_bundle_control.predictors import (
     CONSTANT_ACCELERATION,
     CONSTANT_RATE,
-    FAR,
-    PREVIEW,
-    REACH,
-    SINUSOID,
-    STEPS,
-    Predictor,
     course_of,
     expected_strain,
+    FAR,
     modelled,
+    Predictor,
     predictor,
     predictor_start,
     predictor_step,
+    PREVIEW,
+    REACH,
+    SINUSOID,
     stays_above,
+    STEPS,
     time_to_fall,
     time_to_rise,
 )
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.parameters import PREDICTORS
 from fam_bundle_model.reference import reference_law, still, strain_reference
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.optimize import brentq
 
 DT, HORIZON, SLOW = 1e-3, 0.3, 1e-3
 KINDS = range(len(PREDICTORS))

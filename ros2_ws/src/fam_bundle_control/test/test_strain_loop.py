@@ -1,22 +1,34 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The outer PI: its sums, its limits, its start and its way out of saturation."""
 
 from pathlib import Path
 
-import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
 from fam_bundle_control.strain_loop import (
-    StrainLoop,
-    StrainLoopState,
     strain_loop,
     strain_loop_start,
     strain_loop_step,
+    StrainLoop,
+    StrainLoopState,
 )
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.parameters import GRAVITY, load_configuration
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 DT = 0.001

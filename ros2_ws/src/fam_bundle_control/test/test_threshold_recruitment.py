@@ -1,11 +1,23 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Threshold recruitment (Figure 4): up at 80 % of the first unit, down at 40 % of the newest."""
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
 
-import numpy as np
-import pytest
+"""Threshold recruitment (Figure 4): up at 80 % of the first unit, down at 40 % of the newest."""
 
 from fam_bundle_control.recruitment import recruitment, recruitment_start
 from fam_bundle_model import fam
+import numpy as np
+import pytest
 
 UP, DOWN = 500e3, 250e3  # the thresholds of conftest.py's law
 
@@ -97,7 +109,8 @@ def test_the_predictions_are_made_all_the_same(supervisor):
 
 
 def test_noise_of_a_pressure_sensor_is_no_tautness(supervisor):
-    """Up to strain zero the de-slack pressure is at most zero: any noise is above it.
+    """
+    Up to strain zero the de-slack pressure is at most zero: any noise is above it.
 
     Below, an empty FAM even carries by its bladder.
     """

@@ -1,31 +1,44 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Reads any bag of a bundle's topics into tables; needs no ROS.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Reads any bag of a bundle's topics into tables; needs no ROS.
 
 MCAP or SQLite, compressed or not, whole or cut short, as ``bag_recorder``, ``ros2 bag record`` and
 ``rosbags`` write them. What could not be read is said in ``Bag.warnings``.
 """
 
+from collections.abc import Callable, Iterable, Iterator
 import contextlib
 import functools
 import json
-import re
-from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
+import re
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 from fam_bundle_io import cdr
 from fam_bundle_io.bag_files import read_parts
 from fam_bundle_io.bag_parts import Damage, Doubt, Messages
 from fam_bundle_io.bag_writer import BagError
-from fam_bundle_io.trace import Trace, empty_trace
+from fam_bundle_io.trace import empty_trace, Trace
 from fam_bundle_model.parameters import (
     Configuration,
     make_configuration,
     parse_yaml,
     seconds,
 )
+import numpy as np
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -65,7 +78,8 @@ COLUMNS = {
 
 
 class Bag(NamedTuple):
-    """What is in a bag.
+    """
+    What is in a bag.
 
     ``tables`` holds one row per message and one column per number, named as in the message
     (``header.stamp.sec``, ``mu_pressure[0]``), by topic; ``types`` the message types; ``records``
@@ -79,7 +93,8 @@ class Bag(NamedTuple):
 
 
 def read_bag(path: Path, topics: Callable[[str], bool] = lambda name: True) -> Bag:
-    """Return what is in the bag at ``path``, a folder or a file, of the ``topics`` asked for.
+    """
+    Return what is in the bag at ``path``, a folder or a file, of the ``topics`` asked for.
 
     Raises BagError when nothing can be read.
     """
@@ -131,7 +146,7 @@ class _Collector:
     """Decodes the messages of one topic in batches."""
 
     def __init__(self, first: Messages) -> None:
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+        from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
         self.topic, self.type, self.definition = first.topic, first.type, first.definition
         self.warnings: list[str] = []
@@ -244,7 +259,8 @@ def _joined(parts: list[np.ndarray]) -> Any:
 
 
 def recorded_configuration(bag: Bag) -> Configuration | None:
-    """Return the configuration that the recorder noted in the bag, None where it did not.
+    """
+    Return the configuration that the recorder noted in the bag, None where it did not.
 
     Raises ConfigurationError when it is damaged.
     """
@@ -255,7 +271,8 @@ def recorded_configuration(bag: Bag) -> Configuration | None:
 
 
 class Run(NamedTuple):
-    """One run of the loop: its trace, the ticks of its rows, and what it lacks, in words.
+    """
+    One run of the loop: its trace, the ticks of its rows, and what it lacks, in words.
 
     The bag does not hold the signals that are ``missing``: they are NaN, or zero in whole numbers.
     """
@@ -276,7 +293,8 @@ def loop_topics(bag: Bag) -> dict[str, list[str]]:
 
 
 def trace_of(bag: Bag, namespace: str = '', run: int = -1) -> Run:
-    """Return the trace of one of the runs in a bag, of all ticks that are on every topic.
+    """
+    Return the trace of one of the runs in a bag, of all ticks that are on every topic.
 
     A topic that the bag misses leaves NaN. Raises BagError without ``bundle_state``.
     """
@@ -344,7 +362,8 @@ class _Rows(NamedTuple):
 def run_tables(
     bag: Bag, namespace: str = '', run: int = -1
 ) -> 'tuple[dict[str, pd.DataFrame], list[str]]':
-    """Return the rows of one run by tick, for each message type of the loop, and warnings.
+    """
+    Return the rows of one run by tick, for each message type of the loop, and warnings.
 
     What answers the samples of the plant belongs to their run. Raises BagError without them.
     """
@@ -380,7 +399,8 @@ def run_tables(
 
 
 def runs_of(table: 'pd.DataFrame') -> np.ndarray:
-    """Return for each row the number of its run, counted from 0.
+    """
+    Return for each row the number of its run, counted from 0.
 
     A run begins at tick 0; where that is lost, ticks fall back by more than some that were late.
     """

@@ -1,24 +1,37 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The files of a bag, and the serialized messages in them as far as they can be read.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The files of a bag, and the serialized messages in them as far as they can be read.
 
 Each file is read by itself: one without its end, or without ``metadata.yaml``, gives all that is
 whole. It may be compressed with zstd, the whole file or each message. What ``metadata.yaml`` says
 is held against what was read.
 """
 
-import re
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+import re
+import tempfile
 from typing import NamedTuple
-
-import numpy as np
-import yaml
 
 from fam_bundle_io.bag_mcap import read_mcap
 from fam_bundle_io.bag_parts import Damage, Doubt, Messages, Part, rows_of, short
 from fam_bundle_io.bag_sqlite import read_sqlite
 from fam_bundle_io.bag_writer import BagError
+import numpy as np
+import yaml
 
 # What files begin with; a message in CDR begins with 0.
 ZSTD, SQLITE = b'\x28\xb5\x2f\xfd', b'SQLite format 3\0'
@@ -27,7 +40,8 @@ LARGEST_MESSAGE = 1 << 30  # bytes; a damaged size would ask for more than there
 
 
 def read_parts(path: Path) -> Iterator[Part]:
-    """Yield what is in the bag at ``path``, a folder or one file, part by part.
+    """
+    Yield what is in the bag at ``path``, a folder or one file, part by part.
 
     Raises BagError when there is no bag.
     """

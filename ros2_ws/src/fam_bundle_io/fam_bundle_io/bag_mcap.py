@@ -1,25 +1,38 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Reads an MCAP file as far as it can be read.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Reads an MCAP file as far as it can be read.
 
 Chunks are taken whole or not at all. Where a record makes no sense, reading goes on at the next
 chunk. How many messages there should be, the end of the file tells.
 """
 
-import os
-import re
-import struct
-import zlib
 from collections.abc import Callable, Iterator
 from io import BytesIO
+import os
 from pathlib import Path
+import re
+import struct
 from typing import Any, BinaryIO, NamedTuple
+import zlib
 
-import numpy as np
+from fam_bundle_io.bag_parts import Damage, Doubt, Messages, Part, short
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema, Statistics
-
-from fam_bundle_io.bag_parts import Damage, Doubt, Messages, Part, short
+import numpy as np
 
 MAGIC = b'\x89MCAP0\r\n'
 HEAD = struct.Struct('<BQ')  # of a record: opcode and length
@@ -138,7 +151,8 @@ class _Mcap:
         return found
 
     def messages_in(self, data: bytes, at: int, *, checked: bool) -> list[Messages]:
-        """Return the messages in the data of a chunk by topic and size.
+        """
+        Return the messages in the data of a chunk by topic and size.
 
         Raises ValueError or struct.error when it is damaged.
         """

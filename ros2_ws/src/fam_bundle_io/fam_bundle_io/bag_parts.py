@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What a bag is read as, part by part, whatever its storage."""
 
 from typing import NamedTuple
@@ -9,7 +22,8 @@ Records = dict[str, dict[str, str]]  # of metadata, by name
 
 
 class Messages(NamedTuple):
-    """Messages of one topic and one size.
+    """
+    Messages of one topic and one size.
 
     ``numbers`` (n) is their order in the bag, ``received`` and ``published`` (n) are times of the
     system clock (ns), ``sequences`` (n) their publisher's numbers of them, 0 where unknown, and

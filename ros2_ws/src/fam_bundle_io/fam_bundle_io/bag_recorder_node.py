@@ -1,24 +1,51 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """ROS node that records the topics of a bundle as a rosbag2 bag."""
 
+from collections.abc import Callable
 import dataclasses
 import fnmatch
 import importlib
 import importlib.metadata
 import json
 import math
+from pathlib import Path
 import platform
 import resource
 import signal
 import sys
 import time
-from collections.abc import Callable
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import rclpy
+from fam_bundle_io.bag_writer import BagError, BagWriter, Item, Topic
+from fam_bundle_io.completeness import (
+    ANSWERS,
+    carries_tick,
+    is_answer,
+    record_of,
+    shortcomings,
+    TopicLedger,
+)
+from fam_bundle_io.message_definitions import complete_definition
+from fam_bundle_model.parameters import Configuration, GROUPS, ProcessParameters, yaml_text
+from fam_bundle_model.schema import ConfigurationError
+from fam_bundle_node.declare import declare_configuration
+from fam_bundle_node.tuning import tune
 from rcl_interfaces.msg import ParameterDescriptor
+import rclpy
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
@@ -26,29 +53,14 @@ from rclpy.node import Node
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
+    qos_check_compatible,
     QoSCompatibility,
     QoSProfile,
     ReliabilityPolicy,
-    qos_check_compatible,
 )
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
-
-from fam_bundle_io.bag_writer import BagError, BagWriter, Item, Topic
-from fam_bundle_io.completeness import (
-    ANSWERS,
-    TopicLedger,
-    carries_tick,
-    is_answer,
-    record_of,
-    shortcomings,
-)
-from fam_bundle_io.message_definitions import complete_definition
-from fam_bundle_model.parameters import GROUPS, Configuration, ProcessParameters, yaml_text
-from fam_bundle_model.schema import ConfigurationError
-from fam_bundle_node.declare import declare_configuration
-from fam_bundle_node.tuning import tune
 
 POLL_PERIOD = 0.01  # s between two times that messages are taken
 LOOK_PERIOD = 0.05  # s between two looks at what topics there are
@@ -92,7 +104,8 @@ class BagRecorder(Node):
     """Takes messages as bytes, and knows their types only to name them."""
 
     def __init__(self, **options: Any) -> None:
-        """Open the bag; raises ConfigurationError for a bad parameter, BagError for a bad bag.
+        """
+        Open the bag; raises ConfigurationError for a bad parameter, BagError for a bad bag.
 
         ``options`` are those of a node.
         """
@@ -140,7 +153,8 @@ class BagRecorder(Node):
     # ---- What to record ----
 
     def look_for_topics(self) -> None:
-        """Subscribe to what is new and wanted; to the plant when the rest of the loop is there.
+        """
+        Subscribe to what is new and wanted; to the plant when the rest of the loop is there.
 
         Also look whether what is recorded has publishers of a lower quality now.
         """
@@ -211,7 +225,8 @@ class BagRecorder(Node):
         )
 
     def _satisfy_all(self, name: str, taps: list[Subscription]) -> None:
-        """Subscribe a second time, to every quality, where the first one misses a publisher.
+        """
+        Subscribe a second time, to every quality, where the first one misses a publisher.
 
         The first one stays, so that nothing is lost between; what comes twice is written once.
         """
@@ -250,7 +265,8 @@ class BagRecorder(Node):
                     self.writer.write(item)
 
     def is_behind(self) -> bool:
-        """Return whether some topic of the loop has come to an earlier tick than another.
+        """
+        Return whether some topic of the loop has come to an earlier tick than another.
 
         What was lost on the way is sent again with the middleware's next heartbeat.
         """
@@ -418,7 +434,8 @@ def record_until_told(recorder: BagRecorder, told: Callable[[], bool]) -> None:
 
 
 def below_the_loop(process: ProcessParameters) -> ProcessParameters:
-    """Return how a recorder runs beside nodes that run like ``process``.
+    """
+    Return how a recorder runs beside nodes that run like ``process``.
 
     With a priority of theirs they would starve it; with the same it would hold them up.
     """

@@ -1,15 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Reads an SQLite database of rosbag2 as far as it can be read, with Python's own SQLite."""
 
-import contextlib
-import sqlite3
 from collections.abc import Iterator, Mapping
+import contextlib
 from pathlib import Path
+import sqlite3
 from typing import NamedTuple
 
-import numpy as np
-
 from fam_bundle_io.bag_parts import Damage, Doubt, Messages, rows_of, short
+import numpy as np
 
 BATCH = 50_000  # messages that are taken together
 

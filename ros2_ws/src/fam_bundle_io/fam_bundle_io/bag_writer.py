@@ -1,22 +1,35 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Writes a rosbag2 bag (MCAP), in a thread of its own where messages must not wait; knows no ROS.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Writes a rosbag2 bag (MCAP), in a thread of its own where messages must not wait; knows no ROS.
 
 The folder, its ``metadata.yaml`` and the contents of the MCAP files follow rosbag2's storage
 version 9 (Jazzy). The format itself is the ``mcap`` package's.
 """
 
-import contextlib
-import os
-import threading
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
+import contextlib
+import os
 from pathlib import Path
+import threading
+import time
 from typing import Any, NamedTuple
 
-import yaml
-
 from fam_bundle_model.files import whole_file
+import yaml
 
 Records = Mapping[str, Mapping[str, str]]  # of metadata, by name
 
@@ -32,7 +45,8 @@ class BagError(Exception):
 
 
 class Topic(NamedTuple):
-    """What a bag says of a topic.
+    """
+    What a bag says of a topic.
 
     ``definition`` is the complete one, ``qos`` the offered profiles as rosbag2 writes them.
     """
@@ -55,7 +69,8 @@ class Item(NamedTuple):
 
 
 class BagWriter:
-    """Takes messages from one thread, and writes them in another.
+    """
+    Takes messages from one thread, and writes them in another.
 
     What waits is bounded by ``memory`` bytes; beyond it messages are dropped and counted.
     """
@@ -70,7 +85,8 @@ class BagWriter:
         head: Records | None = None,
         watch: Callable[[Item], None] | None = None,
     ) -> None:
-        """Make ``folder``; raises BagError when it exists or cannot be made.
+        """
+        Make ``folder``; raises BagError when it exists or cannot be made.
 
         ``watch`` gets every message in the writing thread; the others are as in BagFolder.
         """
@@ -98,7 +114,8 @@ class BagWriter:
         self._waiting.append(item)
 
     def close(self, records: Callable[[], Records] = dict) -> None:
-        """Write what waits, the ``records`` of metadata by name, and ``metadata.yaml``.
+        """
+        Write what waits, the ``records`` of metadata by name, and ``metadata.yaml``.
 
         Raises BagError when the disk did not take all.
         """
@@ -154,7 +171,8 @@ class BagFolder:
         split_duration: float = 0.0,
         head: Records | None = None,
     ) -> None:
-        """Make ``folder``; raises BagError when it exists or cannot be made.
+        """
+        Make ``folder``; raises BagError when it exists or cannot be made.
 
         Its files are called ``name``, or as the folder. A new one begins after ``split_size``
         bytes or ``split_duration`` s (0: never); each begins with the records of metadata

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Serialized messages of one type as columns, decoded many at a time.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Serialized messages of one type as columns, decoded many at a time.
 
 Messages of the loop differ only in their numbers: the first of them tells where every field lies,
 and all that have the same lengths are decoded by numpy at once, some hundred times faster than one
@@ -167,7 +181,8 @@ class Part(NamedTuple):
 
 
 def decode(messages: np.ndarray, name: str, types: Types) -> Iterator[Part]:
-    """Yield all messages, those of one layout together.
+    """
+    Yield all messages, those of one layout together.
 
     ``messages`` is a (n, size) array of bytes, ``types`` is as from
     ``rosbags.typesys.get_types_from_msg``. Messages that are damaged come without columns. Raises

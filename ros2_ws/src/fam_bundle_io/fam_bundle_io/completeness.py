@@ -1,9 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Whether a record of the loop is whole: what its ticks and sequence numbers prove."""
 
+from collections.abc import Iterator, Mapping, Sequence
 import json
 import struct
-from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 # A message of the loop begins with a header and a tick. In CDR: four bytes that tell the byte
@@ -24,7 +37,8 @@ def carries_tick(definition: str) -> bool:
 
 
 def tick_of(data: bytes) -> int:
-    """Return the tick of a serialized message of the loop.
+    """
+    Return the tick of a serialized message of the loop.
 
     Raises struct.error or IndexError when it is too short.
     """
@@ -44,7 +58,8 @@ class TopicLedger:
     """Counts what came on one topic and what is missing between."""
 
     def __init__(self, *, ticks: bool, answers: bool = False) -> None:
-        """Know nothing yet; ``ticks`` tells whether the messages carry one.
+        """
+        Know nothing yet; ``ticks`` tells whether the messages carry one.
 
         Where they are ``answers``, a tick was not answered if its publisher numbered the messages
         around it one after the other.
@@ -127,7 +142,8 @@ def record_of(
     skipped: Mapping[str, str],
     damage: Sequence[str] = (),
 ) -> dict[str, str]:
-    """Return what a bag says of its completeness, each value as JSON.
+    """
+    Return what a bag says of its completeness, each value as JSON.
 
     ``summaries`` are those of the topics' ledgers, ``dropped`` the messages that the disk did not
     take in time, None where nobody knows, ``skipped`` why a topic was not recorded, ``damage``
@@ -181,7 +197,8 @@ def _ranges(gaps: Sequence[tuple[int, int]]) -> str:
 
 
 def _ends(summaries: Mapping[str, dict[str, Any]]) -> Iterator[str]:
-    """Yield which topics begin later than with tick 0, or end earlier than others of a bundle.
+    """
+    Yield which topics begin later than with tick 0, or end earlier than others of a bundle.
 
     That shows neither in their own ticks nor in their sequence numbers.
     """

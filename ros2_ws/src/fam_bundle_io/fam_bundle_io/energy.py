@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Where the hydraulic energy of a run goes: into the load, and into the valves, by state.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Where the hydraulic energy of a run goes: into the load, and into the valves, by state.
 
 Our derivation. The source gives ``p_s Q_s``. Of that, the oil that enters unit i at its pressure
 carries ``p_i Q_i`` into the muscles; ``(p_s - p_i) Q_i`` is lost in valve and hose on the way, and
@@ -15,14 +29,13 @@ from the spool commands and pressures by equations 5 and 6.
 import math
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
-from fam_bundle_io.metrics import NotMeasurable, Window, steps, ticks_in
+from fam_bundle_io.metrics import NotMeasurable, steps, ticks_in, Window
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.compile import compiled
-from fam_bundle_model.hydraulics import HydraulicLaw, hydraulic_law, unit_flow
+from fam_bundle_model.hydraulics import hydraulic_law, HydraulicLaw, unit_flow
 from fam_bundle_model.parameters import Configuration
+import numpy as np
+import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
@@ -30,7 +43,8 @@ SMOOTHING = 0.05  # s over which the strain is averaged to tell contraction from
 
 
 class Powers(NamedTuple):
-    """Powers in W at every tick: (ticks,), or (ticks, units) for those of motor units.
+    """
+    Powers in W at every tick: (ticks,), or (ticks, units) for those of motor units.
 
     ``load`` is what the bundle does on the load, negative where the load drives it;
     ``source`` is what it gives, ``relieved`` what comes back to it. ``contracting`` tells at which
@@ -50,7 +64,8 @@ class Powers(NamedTuple):
 
 
 class Energy(NamedTuple):
-    """Energies in J over a window, or what of it was spent in one state; of motor units as lists.
+    """
+    Energies in J over a window, or what of it was spent in one state; of motor units as lists.
 
     ``output`` is done on the load while the bundle contracts, ``returned`` is what the load gives
     back while it lengthens. ``supply_loss`` and ``return_loss`` are throttled in each unit's valve
@@ -82,7 +97,8 @@ def _spool_and_flow(
     flow: Array,
     supplied: npt.NDArray[np.bool_],
 ) -> None:
-    """Fill ``flow`` and ``supplied`` (ticks, units).
+    """
+    Fill ``flow`` and ``supplied`` (ticks, units).
 
     Each command acts from its tick on, behind the spool's lag.
     """
@@ -98,7 +114,8 @@ def _spool_and_flow(
 def powers(
     trace: Trace, configuration: Configuration, applied_spool: Array | None = None
 ) -> Powers:
-    """Return all powers of a run that begins with the valves at rest.
+    """
+    Return all powers of a run that begins with the valves at rest.
 
     ``applied_spool`` (ticks, units) are the commands that acted from each tick to the next, where
     they are not those of the trace: in real time they may come late.
@@ -137,7 +154,8 @@ def _contracting(strain: Array, step: float) -> npt.NDArray[np.bool_]:
 
 
 def energy(trace: Trace, found: Powers, window: Window, state: int | None = None) -> Energy:
-    """Return what the powers ``found`` in ``trace`` come to within ``window``.
+    """
+    Return what the powers ``found`` in ``trace`` come to within ``window``.
 
     Only of the ticks with ``state`` units recruited, if that is given. Raises NotMeasurable where
     something in it is not finite.
@@ -188,7 +206,8 @@ def summary(spent: Energy) -> dict[str, float | None]:
 
 
 def energy_by_state(trace: Trace, found: Powers, window: Window) -> dict[int, Energy]:
-    """Return ``energy`` of each number of recruited units that occurs within ``window``.
+    """
+    Return ``energy`` of each number of recruited units that occurs within ``window``.
 
     Energies add up to those of the window. What is stored in one state and spent in another
     stands in ``unexplained`` of both. Raises NotMeasurable where something is not finite.

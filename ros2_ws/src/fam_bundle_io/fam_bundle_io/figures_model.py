@@ -1,25 +1,30 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Figures of the model: fill response (Figure 6), source (Figure 10), one FAM, lag table."""
 
 from collections.abc import Mapping
 
-import numpy as np
-from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.ticker import MaxNLocator
-
 from fam_bundle_io.figures_style import (
+    Array,
     KILOPASCAL,
     LAG,
+    legend_beside,
     LITRES_PER_MINUTE,
     PERCENT,
-    SOURCE,
-    Array,
-    legend_beside,
     signal,
+    SOURCE,
     styled,
     unit_style,
 )
@@ -28,9 +33,16 @@ from fam_bundle_model import fam
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.fam import FamLaw
 from fam_bundle_model.hydraulics import hydraulic_law
-from fam_bundle_model.lag_table import REACHED, LagTable, fill_response
+from fam_bundle_model.lag_table import fill_response, LagTable, REACHED
 from fam_bundle_model.parameters import Configuration
 from fam_bundle_model.pressure_pi import pressure_gains
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
+import numpy as np
 
 TARGET = 0.8  # of the nominal pressure: the paper's example of a de-slack pressure
 POINTS = 5000  # of all traces together under the source's line
@@ -41,7 +53,8 @@ MAP = ListedColormap(colormaps['cividis'](np.linspace(0.0, 0.85, 256)))
 
 @styled
 def response_figure(configuration: Configuration) -> Figure:
-    """Return the filling of a slack unit from the nominal source pressure (Figure 6).
+    """
+    Return the filling of a slack unit from the nominal source pressure (Figure 6).
 
     Source and unit pressure (kPa) over time (s) after a step of the reference to a de-slack
     pressure of 80 % of the nominal one, with the recruitment lag and the source pressure drop.
@@ -125,7 +138,8 @@ def _span(axes: Axes, start: tuple[float, float], stop: tuple[float, float]) -> 
 
 @styled
 def source_figure(configuration: Configuration, traces: Mapping[str, Trace]) -> Figure:
-    """Return the source's pressure (kPa) over its flow (L/min), settled: a line (Figure 10).
+    """
+    Return the source's pressure (kPa) over its flow (L/min), settled: a line (Figure 10).
 
     Under it the ticks of ``traces``, which leave the line while the source lags behind its flow.
     """
@@ -168,7 +182,8 @@ def source_figure(configuration: Configuration, traces: Mapping[str, Trace]) -> 
 
 @styled
 def surface_figure(configuration: Configuration) -> Figure:
-    """Return force (N) over strain (%) of one FAM of the first motor unit at several pressures.
+    """
+    Return force (N) over strain (%) of one FAM of the first motor unit at several pressures.
 
     The law of equations 1-4; panels: the whole range, and compression enlarged. Solid: straight;
     dashed: buckled; dotted: collapsed.
@@ -226,7 +241,8 @@ def _bounds(law: FamLaw, pressure: float) -> tuple[float, float]:
 
 @styled
 def lag_table_figure(table: LagTable) -> Figure:
-    """Return recruitment lag (s) and source pressure drop (kPa) over the grid (Figure 6).
+    """
+    Return recruitment lag (s) and source pressure drop (kPa) over the grid (Figure 6).
 
     One row of panels for the motor units that share their values; grey: never reached.
     """

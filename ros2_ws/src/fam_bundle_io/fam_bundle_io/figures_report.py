@@ -1,19 +1,31 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Figures of a report beside those of the paper: energy, and timing of the loop."""
 
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-from matplotlib.figure import Figure
-
 from fam_bundle_io.figures_style import (
-    UNIT_COLOURS,
     legend_beside,
     scheme_style,
     styled,
+    UNIT_COLOURS,
 )
 from fam_bundle_io.timing import Timing
+from matplotlib.figure import Figure
+import numpy as np
 
 MICROSECONDS = 1e6  # per s
 SHORTEST = 1.0  # us that the logarithmic axis shows
@@ -21,7 +33,8 @@ SHORTEST = 1.0  # us that the logarithmic axis shows
 
 @styled
 def energy_figure(energies: Mapping[str, Mapping[str, Any]]) -> Figure:
-    """Return where the hydraulic input of the last cycle went (J), a bar for each run.
+    """
+    Return where the hydraulic input of the last cycle went (J), a bar for each run.
 
     ``energies`` holds the values of ``fam_bundle_io.energy.Energy`` by the names of the runs.
     """

@@ -1,35 +1,47 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Figures of runs: one run (Figures 11-13), several (Figure 14), and a prediction (Figure 7)."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-
 from fam_bundle_io.figures_style import (
+    Array,
     DOWNSHIFT,
     KILOPASCAL,
     LAG,
-    MEASURED,
-    PERCENT,
-    REFERENCE,
-    SOURCE,
-    UPSHIFT,
-    Array,
     last_cycle,
     legend_above,
     legend_beside,
     mark,
+    MEASURED,
+    PERCENT,
+    REFERENCE,
     scheme_style,
     signal,
+    SOURCE,
     styled,
     unit_style,
+    UPSHIFT,
 )
 from fam_bundle_io.metrics import shift_times
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
 
 LEAD = 0.05  # a prediction is shown this share of a cycle before its shift
 POINTS = 100  # of an expected trajectory
@@ -49,7 +61,8 @@ def _shifts_within(trace: Trace, window: slice) -> tuple[list[float], list[float
 
 @styled
 def run_figure(trace: Trace, title: str, window: slice | None = None) -> Figure:
-    """Return the last cycle of a run of any scheme (Figures 11, 12 and 13), or ticks ``window``.
+    """
+    Return the last cycle of a run of any scheme (Figures 11, 12 and 13), or ticks ``window``.
 
     Panels: strain (%); times to saturation and desaturation beside the recruitment lag (s),
     where the trace holds any; recruitment state; pressures (kPa); strain error (%). A vertical
@@ -141,7 +154,8 @@ def _draw_pressures(axes: Axes, trace: Trace, window: slice) -> None:
 def comparison_figure(
     traces: Mapping[str, Trace], windows: Mapping[str, slice] | None = None
 ) -> Figure:
-    """Return how the schemes in ``traces`` (by their names) track the last cycle (Figure 14).
+    """
+    Return how the schemes in ``traces`` (by their names) track the last cycle (Figure 14).
 
     ``windows`` are the ticks of the cycles, where they are known.
     Panels: reference and strain (%) around the first upshifts, a triangle at each; strain errors
@@ -211,7 +225,8 @@ def _zoom(axes: Axes, curves: list[tuple[Array, Array]], start: float, stop: flo
 
 
 class Prediction(NamedTuple):
-    """One tick's prediction: its number, time (s), strain, lag (s) and time to the limit (s).
+    """
+    One tick's prediction: its number, time (s), strain, lag (s) and time to the limit (s).
 
     The lag is infinite where the next unit would never be filled.
     """
@@ -226,7 +241,8 @@ class Prediction(NamedTuple):
 def prediction_before(
     trace: Trace, configuration: Configuration, name: str, shift: float
 ) -> Prediction | None:
-    """Return the prediction a twentieth of a cycle before the shift at ``shift`` s.
+    """
+    Return the prediction a twentieth of a cycle before the shift at ``shift`` s.
 
     ``name`` is ``time_to_saturation`` or ``time_to_desaturation``. Where it does not apply at
     that instant the first later one counts, up to the shift; None where there is none.
@@ -250,7 +266,8 @@ def prediction_before(
 def prediction_figure(
     trace: Trace, configuration: Configuration, expectation: Expectation
 ) -> Figure:
-    """Return the prediction before the last upshift and before the last downshift (Figure 7).
+    """
+    Return the prediction before the last upshift and before the last downshift (Figure 7).
 
     Each panel: strain (%), the expectation E(t) from one instant, the modelled strain limit,
     where E(t) stands then, and the times (s) to saturation or desaturation and of the recruitment

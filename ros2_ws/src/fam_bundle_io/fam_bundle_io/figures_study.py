@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Figures of a study: tracking against efficiency, heat maps, sensitivity.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Figures of a study: tracking against efficiency, heat maps, sensitivity.
 
 ``columns`` holds one value for each case, None where there is none, by the names of the result:
 ``scheme``, the varied parameters, and what was measured.
@@ -8,14 +22,13 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
+from fam_bundle_io.figures_style import Array, PERCENT, scheme_style, styled
+from fam_bundle_model.parameters import GROUPS
+from fam_bundle_model.schema import declarations
 from matplotlib import colors, patches, ticker
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-
-from fam_bundle_io.figures_style import PERCENT, Array, scheme_style, styled
-from fam_bundle_model.parameters import GROUPS
-from fam_bundle_model.schema import declarations
+import numpy as np
 
 Columns = Mapping[str, Sequence[Any]]
 
@@ -86,7 +99,8 @@ def axis_words(name: str) -> str:
 
 @styled
 def tradeoff_figure(columns: Columns, schemes: Sequence[str], rivals: Sequence[str]) -> Figure:
-    """Return IAE (s) and maximum error (% strain) of every case against its efficiency (%).
+    """
+    Return IAE (s) and maximum error (% strain) of every case against its efficiency (%).
 
     A large mark is the median of a scheme or rival over its cases, its bars from the first to
     the third quartile.
@@ -154,7 +168,8 @@ def _plain_ticks(axis: Any) -> None:
 def heat_map_figure(
     columns: Columns, schemes: Sequence[str], x: str, y: str, quantity: Quantity
 ) -> Figure:
-    """Return ``quantity`` over two axes of the grid, a panel for each scheme.
+    """
+    Return ``quantity`` over two axes of the grid, a panel for each scheme.
 
     Where the study varies more than the two axes, a cell is the median of its cases. A cell
     without any number is hatched; one with a case that chatters is crossed.
@@ -293,7 +308,8 @@ def _label(value: Any) -> str:
 def sensitivity_figure(
     columns: Columns, schemes: Sequence[str], parameters: Sequence[str]
 ) -> Figure:
-    """Return Spearman's rank correlation of each sampled parameter with what is measured.
+    """
+    Return Spearman's rank correlation of each sampled parameter with what is measured.
 
     Bars for each scheme, the parameter that matters most on top; 95 % of what chance gives lies
     between the dashed lines.
@@ -338,7 +354,8 @@ def sensitivity_figure(
 def rank_correlations(
     columns: Columns, scheme: str, parameters: Sequence[str], metric: str
 ) -> list[float]:
-    """Return Spearman's correlation of each of ``parameters`` with ``metric`` in a scheme.
+    """
+    Return Spearman's correlation of each of ``parameters`` with ``metric`` in a scheme.
 
     NaN where fewer than three cases have numbers, or where nothing differs.
     """

@@ -1,20 +1,32 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What all figures share: style, colours, windows of a trace, and the files."""
 
-import io
 from collections.abc import Mapping
+import io
 from pathlib import Path
 from typing import Any
-
-import matplotlib
-import numpy as np
-import numpy.typing as npt
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from fam_bundle_io.metrics import valleys
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.files import whole_file
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
@@ -57,7 +69,8 @@ def signal(trace: Trace, name: str) -> Array:
 
 
 def last_cycle(trace: Trace) -> slice:
-    """Return the ticks of the last whole cycle of the reference, from valley to valley.
+    """
+    Return the ticks of the last whole cycle of the reference, from valley to valley.
 
     All ticks where the reference has no valley inside the run.
     """
@@ -88,7 +101,8 @@ def legend_above(axes: Axes, columns: int) -> None:
 
 @styled
 def save_figures(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
-    """Write each figure as ``folder/<name>.png`` (150 dpi) and ``.pdf``; return the paths.
+    """
+    Write each figure as ``folder/<name>.png`` (150 dpi) and ``.pdf``; return the paths.
 
     Everything is drawn before the first file is written, and each file appears whole. Files of
     the same figures by the same matplotlib are equal to the byte.

@@ -1,26 +1,34 @@
-# SPDX-License-Identifier: Apache-2.0
-"""ROS node of a real rig: valve_command in, bundle_state out, like the plant simulator.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+ROS node of a real rig: valve_command in, bundle_state out, like the plant simulator.
 
 A managed node. ``configure`` opens the card, which is then read; ``activate`` allows ``~/arm``,
 which begins a run. Only the thread of the card touches it; callbacks ask it for what they want.
 """
 
+from collections.abc import Callable
 import dataclasses
 import functools
+from pathlib import Path
 import sys
 import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-from rclpy.duration import Duration
-from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
-from rclpy.lifecycle.node import LifecycleNodeMixin
-from std_srvs.srv import Trigger
-
 from fam_bundle_io.hardware.backend import load_backend, make_setup
-from fam_bundle_io.hardware.calibration import HardwareFile, hardware_text, load_hardware
+from fam_bundle_io.hardware.calibration import hardware_text, HardwareFile, load_hardware
 from fam_bundle_io.hardware.card_thread import CardThread, Hooks
 from fam_bundle_io.hardware.monitor import Monitor, Sample
 from fam_bundle_io.hardware.safety import Refused, State
@@ -33,6 +41,11 @@ from fam_bundle_node.qos import LATCHED
 from fam_bundle_node.run import run_node
 from fam_bundle_node.steady_timer import SteadyTimer
 from fam_bundle_node.ticks import TickError
+import numpy as np
+from rclpy.duration import Duration
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle.node import LifecycleNodeMixin
+from std_srvs.srv import Trigger
 
 GROUPS = (
     'fam',
@@ -195,7 +208,8 @@ class HardwareBridge(LoopNode, LifecycleNodeMixin):
     # ---- Callbacks ----
 
     def _guarded(self, callback: Callable[..., Any]) -> Callable[..., Any]:
-        """Return ``callback`` so that an error that nobody expected is a fault and is said.
+        """
+        Return ``callback`` so that an error that nobody expected is a fault and is said.
 
         The executor would end the node for it, and with it the one who tells why.
         """

@@ -1,9 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Complete message definitions, as a bag holds them so that it needs no workspace to be read."""
 
-import re
 from collections.abc import Callable
 from pathlib import Path
+import re
 
 FIELD = re.compile(r'^\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w')
 BUILT_IN = {
@@ -27,11 +40,12 @@ SEPARATOR = '=' * 80
 
 
 def installed_definition(name: str) -> str:
-    """Return the text of ``package/msg/Name`` of the sourced workspaces.
+    """
+    Return the text of ``package/msg/Name`` of the sourced workspaces.
 
     Raises FileNotFoundError where it is not installed.
     """
-    from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+    from ament_index_python.packages import get_package_share_directory, PackageNotFoundError
 
     package, _, message = name.split('/')
     try:

@@ -1,14 +1,26 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What a trace says of a run: tracking (equations 17 and 18), shifts, states, saturation."""
 
 from itertools import pairwise
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration
+import numpy as np
+import numpy.typing as npt
 
 SATURATED = 0.97  # share of the source pressure from which a unit counts as saturated
 AT_LEAST = 1e-3  # share of the reference's range within which it is at its least
@@ -35,7 +47,8 @@ class Window(NamedTuple):
 
 
 def tracking(trace: Trace, start: float, stop: float) -> Tracking:
-    """Return the metrics over ``start <= time < stop`` (s).
+    """
+    Return the metrics over ``start <= time < stop`` (s).
 
     Each tick stands for the time until the next one, or until ``stop``: in real time periods can
     be skipped.
@@ -70,7 +83,8 @@ def steps(trace: Trace) -> npt.NDArray[np.float64]:
 
 
 def shift_times(trace: Trace) -> tuple[list[float], list[float]]:
-    """Return the times in s of the upshifts and of the downshifts.
+    """
+    Return the times in s of the upshifts and of the downshifts.
 
     A run begins with one unit; where the trace begins later, nothing is known of what was before.
     """
@@ -87,7 +101,8 @@ def shortest_interval(trace: Trace) -> float:
 
 
 def needless_shifts(trace: Trace) -> int:
-    """Return how many shifts the reference gave no reason for: none unless the scheme chatters.
+    """
+    Return how many shifts the reference gave no reason for: none unless the scheme chatters.
 
     The reference crosses the strain at which a step of the ladder is needed at most once in each
     of its rises and falls, wherever that strain is. So each rise accounts for one shift up over
@@ -115,7 +130,8 @@ def needless_shifts(trace: Trace) -> int:
 
 
 def _turns(values: npt.NDArray[np.float64], enough: float) -> tuple[list[int], bool]:
-    """Return where ``values`` begin to rise or fall, in turn, by more than ``enough``.
+    """
+    Return where ``values`` begin to rise or fall, in turn, by more than ``enough``.
 
     And whether they rise first.
     """
@@ -150,7 +166,8 @@ def valleys(reference: npt.NDArray[np.float64]) -> list[int]:
 
 
 def whole_cycles(trace: Trace, configuration: Configuration | None = None) -> list[Window]:
-    """Return the cycles of the reference that the trace holds from their first tick to the last.
+    """
+    Return the cycles of the reference that the trace holds from their first tick to the last.
 
     A reference that does not repeat is one cycle, the whole run.
     Where no ``configuration`` tells them they are taken from valley to valley of the reference.
@@ -169,7 +186,8 @@ def whole_cycles(trace: Trace, configuration: Configuration | None = None) -> li
 
 
 def _is_valley(trace: Trace, tick: int) -> bool:
-    """Return whether the reference has a valley at ``tick``, one of ``valleys``.
+    """
+    Return whether the reference has a valley at ``tick``, one of ``valleys``.
 
     Those inside the run are valleys; its ends are, where the reference is at its least there: a
     run that begins later than at 0 s, or is cut short, begins or ends within a cycle.

@@ -1,20 +1,33 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Makes a whole bag of what can be read of a damaged one."""
 
-import json
-import shutil
 from collections.abc import Callable, Iterator
+import json
 from pathlib import Path
+import shutil
 from typing import Any, NamedTuple
 
 from fam_bundle_io.bag_files import read_parts
 from fam_bundle_io.bag_parts import Damage, Messages, Part
 from fam_bundle_io.bag_writer import BagError, BagFolder, Item, Topic
 from fam_bundle_io.completeness import (
-    TopicLedger,
     carries_tick,
     is_answer,
     record_of,
+    TopicLedger,
 )
 
 COMPLETENESS, RECOVERY = 'fam_bundle.completeness', 'fam_bundle.recovery'
@@ -40,7 +53,8 @@ def look(bag: Path) -> Found:
 
 
 class Recovery(NamedTuple):
-    """What was written: a ledger's summary for each topic, and in words what was lost.
+    """
+    What was written: a ledger's summary for each topic, and in words what was lost.
 
     ``missing`` is all that the new bag lacks, also of what was missing before it was damaged.
     """
@@ -53,7 +67,8 @@ class Recovery(NamedTuple):
 def recover_bag(
     bag: Path, out: Path, progress: Callable[[int], None] = lambda done: None
 ) -> Recovery:
-    """Write what can be read of ``bag`` as a whole bag into the folder ``out``.
+    """
+    Write what can be read of ``bag`` as a whole bag into the folder ``out``.
 
     ``progress`` is called with the messages written so far. Raises BagError when ``out`` exists or
     cannot be written, or nothing can be read; ``out`` is then not there.

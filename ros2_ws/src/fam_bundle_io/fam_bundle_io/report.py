@@ -1,41 +1,53 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The numbers of a report: what each recorded run tells, and what its bag lacks."""
 
+from collections.abc import Sequence
 import contextlib
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from fam_bundle_io.bag import (
-    LOOP,
-    STATE,
     Bag,
-    Run,
+    LOOP,
     loop_topics,
     read_bag,
     recorded_configuration,
+    Run,
     runs_of,
+    STATE,
     trace_of,
 )
 from fam_bundle_io.bag_writer import BagError
-from fam_bundle_io.energy import Powers, energy, energy_by_state, powers
+from fam_bundle_io.energy import energy, energy_by_state, Powers, powers
 from fam_bundle_io.metrics import (
-    Window,
     shift_times,
     steps,
     time_at_source,
     time_in_state,
     tracking,
     whole_cycles,
+    Window,
 )
-from fam_bundle_io.timing import Timing, applied_spool, spread, timing
+from fam_bundle_io.timing import applied_spool, spread, Timing, timing
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration
 from fam_bundle_model.schema import ConfigurationError
+import numpy as np
+import numpy.typing as npt
 
 LONGEST_GAP = 1.0  # s between two ticks
 OIL_MISMATCH = 0.02  # between modelled and measured flow, beyond which losses are doubtful
@@ -59,7 +71,8 @@ class ReportedRun(NamedTuple):
 def reported_runs(
     path: Path, name: str, given: Configuration | None = None
 ) -> tuple[list[ReportedRun], list[str]]:
-    """Return the last run of every bundle in the bag at ``path``, and what is wrong with it.
+    """
+    Return the last run of every bundle in the bag at ``path``, and what is wrong with it.
 
     ``given`` takes the place of the configuration in the bag. Raises BagError when nothing can be
     read.
@@ -96,7 +109,8 @@ def reported_runs(
 
 
 def names_of(paths: Sequence[Path]) -> list[str]:
-    """Return a short name for each bag: the ends of their paths as far as they differ.
+    """
+    Return a short name for each bag: the ends of their paths as far as they differ.
 
     Raises BagError when the same bag is named twice.
     """

@@ -1,30 +1,42 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Writes the report on some bags: page, figures, tables and numbers."""
 
-import json
 from collections.abc import Callable, Sequence
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_io.metrics import slice_of
 from fam_bundle_io.report import (
-    ReportedRun,
     last_cycle_of,
     names_of,
     reported_runs,
+    ReportedRun,
     without_nan,
 )
 from fam_bundle_io.report_page import report_page
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.files import whole_file
 from fam_bundle_model.parameters import Configuration
+import numpy as np
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
+    import pandas as pd
 
 
 def steps_of(bags: Sequence[Path]) -> int:
@@ -38,7 +50,8 @@ def write_report(
     configuration: Configuration | None = None,
     progress: Callable[[int], None] = lambda done: None,
 ) -> tuple[list[ReportedRun], list[str]]:
-    """Write the report on the last run of every bundle in ``bags`` to ``folder``.
+    """
+    Write the report on the last run of every bundle in ``bags`` to ``folder``.
 
     ``configuration`` takes the place of those in the bags. Returns the runs and what is
     wrong with bags that cannot be read or hold no run. Raises BagError when no bag holds one;

@@ -1,12 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The report as one interactive page: nothing in it is loaded from elsewhere."""
 
-import html
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-import numpy.typing as npt
+import html
+from typing import Any, TYPE_CHECKING
 
 from fam_bundle_io.figures_runs import same_curve
 from fam_bundle_io.figures_style import (
@@ -19,7 +29,9 @@ from fam_bundle_io.figures_style import (
     UPSHIFT,
 )
 from fam_bundle_io.metrics import ticks_in
-from fam_bundle_io.report import ReportedRun, last_cycle_of, plural
+from fam_bundle_io.report import last_cycle_of, plural, ReportedRun
+import numpy as np
+import numpy.typing as npt
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -245,7 +257,8 @@ def _x(time: npt.NDArray[np.float64]) -> dict[str, Any]:
 
 
 def extremes(values: npt.NDArray[np.float64], points: int) -> npt.NDArray[np.int64]:
-    """Return the indices of at most ``points`` values that a drawing of all of them needs.
+    """
+    Return the indices of at most ``points`` values that a drawing of all of them needs.
 
     Of each of ``points / 2`` equal parts: where it is least and where it is largest.
     """

@@ -1,15 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What the paper's text says of the shapes in its Figures 11-14, checked on traces."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from fam_bundle_io.metrics import SATURATED, shift_times
 from fam_bundle_io.trace import Trace
 from fam_bundle_model.parameters import Configuration
+import numpy as np
+import numpy.typing as npt
 
 AFTER = 1.5  # s after an upshift that count as immediately following it
 
@@ -68,7 +80,8 @@ def _last_shift(trace: Trace) -> _Run | None:
 
 
 def paper_claims(configuration: Configuration, traces: Mapping[str, Trace]) -> list[Claim]:
-    """Return each statement that the text makes on Figures 11-14, checked on the last cycle.
+    """
+    Return each statement that the text makes on Figures 11-14, checked on the last cycle.
 
     ``traces`` holds the schemes ``baseline``, ``lag`` and ``lag_pressure``. Where one of them
     never shifts, nothing can hold.

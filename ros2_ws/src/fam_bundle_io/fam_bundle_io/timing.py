@@ -1,19 +1,32 @@
-# SPDX-License-Identifier: Apache-2.0
-"""How punctual a recorded loop was: time from sample to sample and to its answers.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How punctual a recorded loop was: time from sample to sample and to its answers.
 
 From the publishers' times in the bag. All nodes must have run on one machine, or on several whose
 clocks agree; a bag without publishers' times (SQLite) gives the recorder's instead.
 """
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, TYPE_CHECKING
 
-import numpy as np
-import numpy.typing as npt
-
-from fam_bundle_io.bag import LOOP, STATE, Bag, Run, run_tables
+from fam_bundle_io.bag import Bag, LOOP, Run, run_tables, STATE
 from fam_bundle_io.metrics import Window
 from fam_bundle_model.hydraulics import TO_TANK
+import numpy as np
+import numpy.typing as npt
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,7 +55,8 @@ class Spread(NamedTuple):
 
 
 class Timing(NamedTuple):
-    """Times of one run.
+    """
+    Times of one run.
 
     ``interval`` (n - 1,) is the time in s between two samples, ``answers`` by topic the time in s
     from a sample to what answers it, ``answered`` by topic how many of the ``samples`` have an
@@ -121,7 +135,8 @@ def spread(times: Array) -> Spread | None:
 
 
 def applied_spool(bag: Bag, found: Run, namespace: str = '', run: int = -1) -> Array:
-    """Return the spool commands that act from each tick of a run to the next (ticks, units).
+    """
+    Return the spool commands that act from each tick of a run to the next (ticks, units).
 
     That is the newest command that was published before the next sample, one of an earlier tick
     where the answer came late; and open to the tank while the plant was safe. Where times of

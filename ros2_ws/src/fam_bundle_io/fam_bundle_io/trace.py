@@ -1,13 +1,25 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The trace of a run: one array per signal, one row per tick; SI units."""
 
 from pathlib import Path
 from typing import Any, cast
 
+from fam_bundle_model.files import whole_file
 import numpy as np
 import numpy.typing as npt
-
-from fam_bundle_model.files import whole_file
 
 Trace = dict[str, npt.NDArray[Any]]
 
@@ -31,7 +43,8 @@ PER_UNIT = ('mu_pressure', 'spool')
 
 
 def empty_trace(ticks: int, units: int) -> Trace:
-    """Return a trace of ``ticks`` rows to be filled: (ticks,) or, per motor unit, (ticks, units).
+    """
+    Return a trace of ``ticks`` rows to be filled: (ticks,) or, per motor unit, (ticks, units).
 
     ``recruitment_state`` is a whole number, the count of recruited motor units.
     """

@@ -1,16 +1,24 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """ROS node that keeps every message of the loop in memory and makes a trace of them."""
 
-import math
 from collections.abc import Callable
+import math
 from typing import Any
 
-import numpy as np
-from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
-from rclpy.serialization import deserialize_message
-
-from fam_bundle_io.trace import Trace, empty_trace
+from fam_bundle_io.trace import empty_trace, Trace
 from fam_bundle_model.parameters import seconds
 from fam_bundle_msgs.msg import (
     BundleState,
@@ -21,6 +29,10 @@ from fam_bundle_msgs.msg import (
 )
 from fam_bundle_node.qos import RECORDER_SUBSCRIPTION, REPORTS
 from fam_bundle_node.stamps import nanoseconds
+import numpy as np
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 
 TOPICS = {
     'pressure_reference': PressureReference,
@@ -34,7 +46,8 @@ class TraceRecorder(Node):
     """Takes the messages as bytes, for the loop runs while it listens; decodes them later."""
 
     def __init__(self, namespace: str = '', *, keep: bool = True) -> None:
-        """Listen to the answers; to the plant, which starts the run, when these are matched.
+        """
+        Listen to the answers; to the plant, which starts the run, when these are matched.
 
         Without ``keep`` only to the loop statistics: somebody else keeps the messages.
         """

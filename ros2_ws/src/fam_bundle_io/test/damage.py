@@ -1,27 +1,40 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Makes bags of the loop, and damages them in some two hundred ways, always the same ones.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Makes bags of the loop, and damages them in some two hundred ways, always the same ones.
 
 ``CASES`` holds all ways by name; each makes one damaged bag in a folder.
 """
 
+from collections.abc import Callable, Iterable, Iterator
 import math
+from pathlib import Path
 import random
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
-import yaml
-from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
-from rosbags.rosbag2 import Writer as RosbagsWriter
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from fam_bundle_io.bag_writer import BagFolder, Item, Topic
 from fam_bundle_io.message_definitions import complete_definition
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+import numpy as np
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
+from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+import yaml
 
 MESSAGES = Path(__file__).parents[2] / 'fam_bundle_msgs' / 'msg'
 TICKS, CHUNK = 600, 50  # ticks of a bag, and of each of its chunks
@@ -199,7 +212,8 @@ def whole_bags(root: Path) -> Callable[[str], Path]:
 
 
 class Case(NamedTuple):
-    """One damaged bag: of which whole one, and how.
+    """
+    One damaged bag: of which whole one, and how.
 
     ``make`` gets the whole bag's folder, one that does not exist, and a source of chance; it
     returns the damaged bag. ``items`` are all messages that were in it before. ``checked``: it was

@@ -1,20 +1,32 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Bags are written and read back by independent readers, whole and damaged."""
 
 import json
+from pathlib import Path
 import random
 import struct
-from pathlib import Path
 from typing import Any
-
-import numpy as np
-import pytest
 
 from fam_bundle_io import completeness
 from fam_bundle_io.bag import read_bag
 from fam_bundle_io.bag_files import read_parts
 from fam_bundle_io.bag_writer import BagError, BagWriter, Item, Topic
 from fam_bundle_io.message_definitions import complete_definition, types_in
+import numpy as np
+import pytest
 
 DEFINITION = """\
 std_msgs/Header header
@@ -36,7 +48,7 @@ TICKS = 3000
 
 
 def store() -> Any:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
     types = get_typestore(Stores.EMPTY)
     types.register(get_types_from_msg(DEFINITION, TYPE))

@@ -1,25 +1,37 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Bags of other writers, compressed or not, whole or damaged, give the same tables."""
 
+from collections.abc import Callable, Iterator
 import math
+from pathlib import Path
 import random
 import shutil
 import sqlite3
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
-
-import numpy as np
-import pandas as pd
-import pytest
-import yaml
-from mcap.writer import CompressionType
-from mcap.writer import Writer as McapWriter
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
 from fam_bundle_io.bag import read_bag
 from fam_bundle_io.bag_writer import BagError
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+import numpy as np
+import pandas as pd
+import pytest
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import get_typestore, Stores
+import yaml
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 WRENCH, TEXT = 'geometry_msgs/msg/WrenchStamped', 'std_msgs/msg/String'

@@ -1,28 +1,40 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Whatever happens to a bag: an error in one line, or what it held, or a warning."""
 
+from collections.abc import Callable, Iterator
 import contextlib
+from pathlib import Path
 import random
 import resource
 import shutil
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import damage
-import numpy as np
-import pandas as pd
-import pytest
-from mcap.reader import make_reader
-
 from fam_bundle_io import cdr
-from fam_bundle_io.bag import Bag, Run, read_bag, trace_of
+from fam_bundle_io.bag import Bag, read_bag, Run, trace_of
 from fam_bundle_io.bag_mcap import read_mcap
 from fam_bundle_io.bag_parts import Damage
 from fam_bundle_io.bag_writer import BagError, Item, Topic
 from fam_bundle_io.completeness import tick_of
+from mcap.reader import make_reader
+import numpy as np
+import pandas as pd
+import pytest
 
 PATIENCE = 20.0  # s; only a hang takes that long
 MEMORY = 1 << 30  # bytes that reading one of these bags of 0.3 MB may ask for

@@ -1,17 +1,24 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The figures hold the data they are given, mark what they say, and are written whole."""
 
 import dataclasses
 import itertools
+from pathlib import Path
 import subprocess
 import sys
-from pathlib import Path
-
-import matplotlib
-import numpy as np
-import pytest
-from matplotlib.figure import Figure
-from matplotlib.image import imread
 
 from fam_bundle_bringup.expectation import expectation
 from fam_bundle_bringup.offline import run_offline
@@ -31,8 +38,13 @@ from fam_bundle_io.metrics import shift_times
 from fam_bundle_io.trace import empty_trace
 from fam_bundle_model import fam
 from fam_bundle_model.bundle import modelled_strain, motor_units
-from fam_bundle_model.lag_table import LagTable, build_lag_table, look_up
-from fam_bundle_model.parameters import PREDICTORS, load_configuration
+from fam_bundle_model.lag_table import build_lag_table, LagTable, look_up
+from fam_bundle_model.parameters import load_configuration, PREDICTORS
+import matplotlib
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+import numpy as np
+import pytest
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 QUICK = {

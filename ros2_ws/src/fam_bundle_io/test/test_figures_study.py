@@ -1,13 +1,21 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What the figures of a study show, against pandas and SciPy."""
 
 import itertools
 from typing import Any
-
-import numpy as np
-import pandas as pd
-import pytest
-from scipy.stats import spearmanr
 
 from fam_bundle_io.figures_study import (
     axis_words,
@@ -17,6 +25,10 @@ from fam_bundle_io.figures_study import (
     sensitivity_figure,
     tradeoff_figure,
 )
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.stats import spearmanr
 
 SCHEMES = ['baseline', 'lag', 'preview']
 FREQUENCIES, AMPLITUDES, MASSES = [0.1, 0.2, 0.3, 0.5], [0.04, 0.05], [10.0, 15.0, 18.8]

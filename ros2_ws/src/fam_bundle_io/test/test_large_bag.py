@@ -1,14 +1,26 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Ten minutes at 1 kHz fit into memory: read as tables and made a trace, or recovered."""
 
+from pathlib import Path
 import subprocess
 import sys
-from pathlib import Path
 
 import damage
-import pytest
-
 from fam_bundle_io.bag_writer import Item
+import pytest
 
 TICKS = 200_000  # a third of ten minutes
 TEN_MINUTES = 600_000

@@ -1,17 +1,29 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Which shifts a reference gives a reason for, on references that cross any level by hand."""
 
 from collections.abc import Sequence
 from itertools import pairwise
 
+from fam_bundle_io.metrics import needless_shifts, shortest_interval
+from fam_bundle_io.trace import empty_trace, Trace
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-
-from fam_bundle_io.metrics import needless_shifts, shortest_interval
-from fam_bundle_io.trace import Trace, empty_trace
 
 TICK = 0.01  # s
 Array = npt.NDArray[np.float64]

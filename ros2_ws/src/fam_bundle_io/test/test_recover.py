@@ -1,23 +1,35 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What can be read of a damaged bag becomes a whole one, and nothing else is touched."""
 
+from collections.abc import Callable
 import json
+from pathlib import Path
 import random
 import resource
 import shutil
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import damage
-import pytest
-from mcap.reader import make_reader
-from rosbags.rosbag2 import Reader
-
 from fam_bundle_io import recover
 from fam_bundle_io.bag import read_bag, trace_of
 from fam_bundle_io.bag_writer import BagError, Item
 from fam_bundle_io.recover import look, recover_bag
+from mcap.reader import make_reader
+import pytest
+from rosbags.rosbag2 import Reader
 
 QOS: dict[str, Any] = {
     'history': 'keep_last',

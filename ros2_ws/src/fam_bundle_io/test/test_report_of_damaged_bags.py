@@ -1,18 +1,30 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """A report on a damaged bag: an error in one line, the true numbers, or a warning."""
 
-import json
-import random
 from collections.abc import Callable
+import json
 from pathlib import Path
+import random
 
 import damage
-import pytest
-
 from fam_bundle_io.bag_writer import BagError
-from fam_bundle_io.report import ReportedRun, reported_runs, without_nan
+from fam_bundle_io.report import reported_runs, ReportedRun, without_nan
 from fam_bundle_io.report_page import report_page
 from fam_bundle_model.parameters import Configuration, load_configuration
+import pytest
 
 CONFIG = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 PAGES = 20  # the first of so many cases is drawn too, which takes longer

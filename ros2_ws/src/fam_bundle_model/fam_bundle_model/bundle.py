@@ -1,15 +1,25 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Motor units in parallel: the bundle's force, its inverse in strain, and what it can reach."""
 
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from fam_bundle_model import fam
 from fam_bundle_model.compile import compiled
-from fam_bundle_model.fam import FamLaw, fam_law, value_of
-from fam_bundle_model.parameters import GRAVITY, Configuration
+from fam_bundle_model.fam import fam_law, FamLaw, value_of
+from fam_bundle_model.parameters import Configuration, GRAVITY
 from fam_bundle_model.reference import (
     Reference,
     reference_law,
@@ -17,6 +27,8 @@ from fam_bundle_model.reference import (
     strain_reference,
 )
 from fam_bundle_model.schema import ConfigurationError
+import numpy as np
+import numpy.typing as npt
 
 HIGHEST_STRAIN = 0.5  # the upper end of the search in strain
 ROUNDING = 1e-12  # of a strain
@@ -74,7 +86,8 @@ def state_force(
 def modelled_strain(
     units: tuple[MotorUnit, ...], recruited: int, pressure: float, load: float
 ) -> float:
-    """Return the strain at which a recruitment state holds ``load`` N: e_mod of equations 15, 16.
+    """
+    Return the strain at which a recruitment state holds ``load`` N: e_mod of equations 15, 16.
 
     Inverse of ``state_force`` in strain by the Illinois variant of regula falsi; the ends of the
     bracket where the state is too strong or too weak anywhere.
@@ -112,7 +125,8 @@ def modelled_strain(
 def balancing_pressure(
     units: tuple[MotorUnit, ...], recruited: int, strain: float, load: float, limit: float
 ) -> float:
-    """Return the pressure in Pa at which a recruitment state holds ``load`` N at ``strain``.
+    """
+    Return the pressure in Pa at which a recruitment state holds ``load`` N at ``strain``.
 
     By bisection between 0 and ``limit``; one of these where the load is out of reach.
     """
@@ -127,7 +141,8 @@ def balancing_pressure(
 
 
 def reachable(configuration: Configuration, units: tuple[MotorUnit, ...]) -> tuple[float, float]:
-    """Return the lowest and the highest strain at which the bundle can hold its load.
+    """
+    Return the lowest and the highest strain at which the bundle can hold its load.
 
     All motor units open to the tank, and all at the nominal source pressure.
     """
@@ -140,7 +155,8 @@ def reachable(configuration: Configuration, units: tuple[MotorUnit, ...]) -> tup
 def check_within_reach(
     law: Reference, name: str, reach: tuple[float, float], pressure: float
 ) -> None:
-    """Raise ConfigurationError where a trajectory ``name`` leaves what can be held.
+    """
+    Raise ConfigurationError where a trajectory ``name`` leaves what can be held.
 
     ``reach`` is as from ``reachable``, ``pressure`` in Pa that of all motor units for the highest.
     """

@@ -1,16 +1,30 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Compilation of plain functions of floats by numba, with a cache that cannot go stale.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Compilation of plain functions of floats by numba, with a cache that cannot go stale.
 
 Every law of the project is written once, as a plain function. ``compiled`` hands it to numba;
 where numba is missing the function is interpreted, which is slower and gives the same bits.
 """
 
+from collections.abc import Callable
 import hashlib
 import importlib.util
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, cast, TypeVar
 
 Function = TypeVar('Function', bound=Callable[..., Any])
 
@@ -35,7 +49,8 @@ def source_digest(packages: tuple[str, ...] = COMPILED_PACKAGES) -> str:
 
 
 def cache_directory() -> Path:
-    """Return the folder for compiled code and lag tables of this user.
+    """
+    Return the folder for compiled code and lag tables of this user.
 
     ``$XDG_CACHE_HOME/fam_bundle``, or ``~/.cache/fam_bundle``.
     """
@@ -60,7 +75,8 @@ _DECORATOR = None if os.environ.get('FAM_BUNDLE_INTERPRET') else _numba_decorato
 
 
 def compiled(function: Function) -> Function:
-    """Compile ``function`` with numba (IEEE arithmetic, no fast math), or return it as it is.
+    """
+    Compile ``function`` with numba (IEEE arithmetic, no fast math), or return it as it is.
 
     ``FAM_BUNDLE_INTERPRET=1`` in the environment leaves every function interpreted.
     """
@@ -68,7 +84,8 @@ def compiled(function: Function) -> Function:
 
 
 def direct(function: Function, *arguments: Any) -> Function:
-    """Return what runs ``function`` without numba's look at the types of each call.
+    """
+    Return what runs ``function`` without numba's look at the types of each call.
 
     That look takes longer than a law itself, 5 us for the supervisor's. The result is for
     arguments of the same types as ``arguments`` only, with which ``function`` is called once

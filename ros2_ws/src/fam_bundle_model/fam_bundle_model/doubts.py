@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What a configuration may ask and hardly means: a loop that rings, units in no order of size."""
 
 import math
@@ -19,7 +32,8 @@ class Ringing(NamedTuple):
 
 
 def ringing(configuration: Configuration) -> tuple[Ringing, ...]:
-    """Return at which gain each motor unit's pressure loop begins to ring.
+    """
+    Return at which gain each motor unit's pressure loop begins to ring.
 
     The unit is taut at zero strain and half the nominal pressure: there it holds little oil and
     the valve passes most, in the mean of both lands. The integral gain is taken as too small to
@@ -39,7 +53,8 @@ def ringing(configuration: Configuration) -> tuple[Ringing, ...]:
 
 
 def highest_loop_gain(lag: float, period: float) -> tuple[float, float]:
-    """Return the gain (1/s) of an integrator behind a lag (s) that rings, and at what frequency.
+    """
+    Return the gain (1/s) of an integrator behind a lag (s) that rings, and at what frequency.
 
     Sampled and held, the loop has the characteristic polynomial
     (z - 1)(z - a) + gain (newest z + earlier); Jury's conditions on its roots.

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""One fluidic artificial muscle: force and volume at a pressure and a strain.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+One fluidic artificial muscle: force and volume at a pressure and a strain.
 
 Kim & Bryant 2025, equations 1-4 and 8. Strain is positive in contraction, force positive in
 tension, pressure gauge. The compressive regions are our closed forms with the paper's structure;
@@ -9,11 +23,10 @@ tension, pressure gauge. The compressive regions are our closed forms with the p
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.parameters import FamParameters
+import numpy as np
+import numpy.typing as npt
 
 TABLE_POINTS = 257
 VACUUM = -101325.0  # Pa gauge
@@ -22,7 +35,8 @@ LARGEST_STRAIN = 0.6  # beyond any strain at which a FAM still has a buckled sha
 
 
 class FamLaw(NamedTuple):
-    """A FAM ready for evaluation: coefficients, and what depends on pressure alone as tables.
+    """
+    A FAM ready for evaluation: coefficients, and what depends on pressure alone as tables.
 
     ``compression`` has one row per pressure (uniform, from 0, ``pressure_step`` Pa apart) and the
     columns buckling strain, its slope, collapse strain, its slope, folding spring (N m), its
@@ -54,7 +68,8 @@ def mesh_coefficient(law: FamLaw, strain: float) -> float:
 
 @compiled
 def bladder_force(law: FamLaw, strain: float) -> float:
-    """Return the bladder's axial force in N (equation 2, Mooney-Rivlin).
+    """
+    Return the bladder's axial force in N (equation 2, Mooney-Rivlin).
 
     The stretches are axial ``1 - e``, hoop ``h`` from the braid's kinematics and radial
     ``1 / ((1 - e) h)``; the force is the stored energy's derivative by length.
@@ -85,7 +100,8 @@ def volume(law: FamLaw, strain: float) -> float:
 
 @compiled
 def deslack_pressure(law: FamLaw, strain: float) -> float:
-    """Return the pressure in Pa at which a FAM at ``strain`` just carries no force (equation 9).
+    """
+    Return the pressure in Pa at which a FAM at ``strain`` just carries no force (equation 9).
 
     Infinite where no pressure makes the braid pull.
     """
@@ -126,7 +142,8 @@ def free_strain(law: FamLaw, pressure: float) -> float:
 def interpolate(
     table: npt.NDArray[np.float64], column: int, step: float, x: float
 ) -> tuple[float, float]:
-    """Return the cubic Hermite value and slope at ``x`` of a table with uniform spacing.
+    """
+    Return the cubic Hermite value and slope at ``x`` of a table with uniform spacing.
 
     ``table[:, column]`` holds the values, the next column their slopes. Outside of the table the
     value is that of the nearest end and the slope is zero.
@@ -180,7 +197,8 @@ def folding_force(law: FamLaw, pressure: float, strain: float, buckling: float) 
 
 @compiled
 def pressure_of(law: FamLaw, oil: float, strain: float, bulk_modulus: float) -> float:
-    """Return the pressure in Pa of one FAM that holds ``oil`` m^3 (counted at zero pressure).
+    """
+    Return the pressure in Pa of one FAM that holds ``oil`` m^3 (counted at zero pressure).
 
     Equation 7 in its conservative form ``oil = V(e_arc) exp(P / E)``. The larger of the taut
     pressure (``e_arc = e``) and the slack one (``e_arc = e_b(P)``) is the true one, since both
@@ -215,7 +233,8 @@ class _Column(NamedTuple):
 
 
 def fam_law(fam: FamParameters, unit: int, maximum_pressure: float, bulk_modulus: float) -> FamLaw:
-    """Return the law of the FAMs of motor unit ``unit`` (0 is the first recruited).
+    """
+    Return the law of the FAMs of motor unit ``unit`` (0 is the first recruited).
 
     The tables reach from 0 to ``maximum_pressure`` (Pa).
     """

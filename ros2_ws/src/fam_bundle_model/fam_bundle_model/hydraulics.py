@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Source, servo valve and hose (Kim & Bryant 2025, equations 5 and 6, Figure 10)."""
 
 import math
@@ -12,7 +25,8 @@ TO_TANK = -1.0
 
 
 class HydraulicLaw(NamedTuple):
-    """Constants of the supply side; SI units.
+    """
+    Constants of the supply side; SI units.
 
     ``valve_conductance`` is ``Q_N / sqrt(p_N)`` of equation 5, ``hose_resistance`` is
     ``8 eta l / (pi r^4)`` of equation 6.
@@ -43,7 +57,8 @@ def hydraulic_law(configuration: Configuration) -> HydraulicLaw:
 
 @compiled
 def unit_flow(law: HydraulicLaw, spool: float, source_pressure: float, pressure: float) -> float:
-    """Return the flow in m^3/s into a motor unit through its valve and its hose in series.
+    """
+    Return the flow in m^3/s into a motor unit through its valve and its hose in series.
 
     ``spool`` > 0 opens the unit to the source, < 0 to the tank (gauge 0, which gives oil back to
     a unit below it). Equations 5 and 6 share one flow; eliminating the pressure between them
@@ -60,7 +75,8 @@ def unit_flow(law: HydraulicLaw, spool: float, source_pressure: float, pressure:
 
 @compiled
 def line_loss(law: HydraulicLaw, flow: float) -> float:
-    """Return the pressure in Pa that ``flow`` m^3/s loses in an open valve and its hose.
+    """
+    Return the pressure in Pa that ``flow`` m^3/s loses in an open valve and its hose.
 
     Equations 5 and 6 in series, solved for the pressure difference.
     """
@@ -70,7 +86,8 @@ def line_loss(law: HydraulicLaw, flow: float) -> float:
 
 @compiled
 def source_pressure_rate(law: HydraulicLaw, source_pressure: float, flow: float) -> float:
-    """Return the rate of the source pressure in Pa/s at ``flow`` m^3/s out of the source.
+    """
+    Return the rate of the source pressure in Pa/s at ``flow`` m^3/s out of the source.
 
     Figure 10's straight line behind a first-order lag; reverse flow is relieved to the tank.
     """

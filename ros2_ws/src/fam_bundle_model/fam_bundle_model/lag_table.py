@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The recruitment lag and the source pressure drop of a shift, tabulated (Figure 6).
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The recruitment lag and the source pressure drop of a shift, tabulated (Figure 6).
 
 One slack motor unit at zero pressure, held at the strain whose de-slack pressure is P_d, follows
 a step of its pressure reference to P_d. The lag is the time to 95 % of P_d; the drop is the
@@ -7,32 +21,32 @@ source's largest loss until then.
 """
 
 import math
-import zipfile
 from pathlib import Path
 from typing import NamedTuple
-
-import numpy as np
-import numpy.typing as npt
+import zipfile
 
 from fam_bundle_model import fam
-from fam_bundle_model.bundle import MotorUnit, motor_units
+from fam_bundle_model.bundle import motor_units, MotorUnit
 from fam_bundle_model.compile import cache_directory, compiled, source_digest
 from fam_bundle_model.files import whole_file
 from fam_bundle_model.hydraulics import (
-    HydraulicLaw,
     hydraulic_law,
+    HydraulicLaw,
     source_pressure_rate,
     unit_flow,
 )
 from fam_bundle_model.parameters import Configuration
-from fam_bundle_model.pressure_pi import PressureGains, clamp, pressure_gains, pressure_pi
+from fam_bundle_model.pressure_pi import clamp, pressure_gains, pressure_pi, PressureGains
+import numpy as np
+import numpy.typing as npt
 
 REACHED = 0.95  # of the de-slack pressure: the paper's definition of the lag
 PHYSICS = ('fam', 'source', 'valve', 'hose', 'oil', 'pressure_loop', 'simulation')
 
 
 class LagTable(NamedTuple):
-    """Uniform axes in Pa, and lag (s, infinity: never) and drop (Pa) of each motor unit.
+    """
+    Uniform axes in Pa, and lag (s, infinity: never) and drop (Pa) of each motor unit.
 
     ``lag`` and ``drop`` have the shape (motor units, source points, de-slack points).
     """
@@ -62,7 +76,8 @@ def fill_response(
     substeps: int,
     trace: npt.NDArray[np.float64],
 ) -> tuple[float, float]:
-    """Return lag (s) and source drop (Pa) of filling a slack unit to ``target`` Pa.
+    """
+    Return lag (s) and source drop (Pa) of filling a slack unit to ``target`` Pa.
 
     The source starts settled at ``hydraulics.nominal_pressure``. The loop runs at ``period`` s,
     the plant at ``period / substeps`` (midpoint rule). As many rows of ``trace`` as it has get
@@ -139,7 +154,8 @@ def _fill_table(
 
 
 def build_lag_table(configuration: Configuration) -> LagTable:
-    """Return the table of ``configuration``: source from its minimum, de-slack pressure from 0.
+    """
+    Return the table of ``configuration``: source from its minimum, de-slack pressure from 0.
 
     Motor units with equal FAMs, count and gains are computed once.
     """
@@ -176,7 +192,8 @@ def _axis(low: float, high: float, points: int) -> npt.NDArray[np.float64]:
 
 @compiled
 def look_up(table: LagTable, unit: int, source_pressure: float, deslack_pressure: float) -> Lag:
-    """Return the bilinear look-up for motor unit ``unit``; pressures in Pa.
+    """
+    Return the bilinear look-up for motor unit ``unit``; pressures in Pa.
 
     Outside of the grid the nearest edge counts and ``outside`` is set. A cell with a corner that
     is never reached is never reached.
@@ -213,7 +230,8 @@ def save_lag_table(table: LagTable, parameters_hash: str, path: Path) -> None:
 
 
 def load_lag_table(path: Path, parameters_hash: str) -> LagTable:
-    """Return the table in ``path``.
+    """
+    Return the table in ``path``.
 
     Raises ValueError when it was built from other parameters, OSError when it cannot be read.
     """

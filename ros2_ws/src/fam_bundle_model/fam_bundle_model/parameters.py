@@ -1,24 +1,38 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Every parameter of the system, declared once (see ``schema.py``), and its YAML file.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Every parameter of the system, declared once (see ``schema.py``), and its YAML file.
 
 The file is a ROS 2 parameter file, so that one file serves the experiment runner, the offline
 loop and single nodes (``--ros-args --params-file``). SI units throughout.
 """
 
+from collections.abc import Iterable, Mapping
 import dataclasses
+from dataclasses import dataclass
 import hashlib
+from itertools import pairwise
 import json
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from fam_bundle_model.files import whole_file
 from fam_bundle_model.schema import (
-    ConfigurationError,
     choice,
+    ConfigurationError,
     flag,
     integer,
     make_group,
@@ -440,7 +454,8 @@ GROUPS: dict[str, type] = {f.name: f.type for f in dataclasses.fields(Configurat
 def make_configuration(
     values: Mapping[str, Mapping[str, Any]], names: Iterable[str] = tuple(GROUPS)
 ) -> Configuration:
-    """Return the configuration of ``values[group][parameter]``.
+    """
+    Return the configuration of ``values[group][parameter]``.
 
     A node that needs only the groups ``names`` gets a configuration without the others.
     Raises ConfigurationError naming the parameter, its value and the bound.
@@ -470,7 +485,8 @@ def make_configuration(
 
 
 def check_allocation(recruitment: RecruitmentParameters, allocation: AllocationParameters) -> None:
-    """Raise ConfigurationError where the thresholds would see what the allocation does itself.
+    """
+    Raise ConfigurationError where the thresholds would see what the allocation does itself.
 
     Orderly, the older units are saturated and the newest may be near its de-slack pressure: each
     pressure would call for the opposite shift.
@@ -595,7 +611,8 @@ def check_recruitment(recruitment: RecruitmentParameters) -> None:
 
 
 def read_yaml(path: Path) -> dict[str, dict[str, Any]]:
-    """Return the parameters in a ROS 2 parameter file, by group.
+    """
+    Return the parameters in a ROS 2 parameter file, by group.
 
     Raises ConfigurationError when the file cannot be read or has another layout.
     """
@@ -609,7 +626,8 @@ def read_yaml(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def parse_yaml(text: str, source: str) -> dict[str, dict[str, Any]]:
-    """Return the parameters in the text of a ROS 2 parameter file, by group.
+    """
+    Return the parameters in the text of a ROS 2 parameter file, by group.
 
     Raises ConfigurationError that begins with ``source`` when it has another layout.
     """
@@ -631,7 +649,8 @@ def parse_yaml(text: str, source: str) -> dict[str, dict[str, Any]]:
 def load_configuration(
     path: Path, changes: Mapping[str, Mapping[str, Any]] | None = None
 ) -> Configuration:
-    """Return the configuration in ``path`` with ``changes[group][parameter]`` laid over it.
+    """
+    Return the configuration in ``path`` with ``changes[group][parameter]`` laid over it.
 
     Raises ConfigurationError; where the file is to blame, its message starts with the path.
     """

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The PI of one motor unit's pressure (Figure 3b, c): the controller's, and the lag table's.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The PI of one motor unit's pressure (Figure 3b, c): the controller's, and the lag table's.
 
 It stands in the model because the recruitment lag is the lag of valve, hose and this law together
 (Figure 6).
@@ -38,7 +52,8 @@ def clamp(value: float, low: float, high: float) -> float:
 def pressure_pi(
     gains: PressureGains, integral: float, reference: float, pressure: float, dt: float
 ) -> tuple[float, float]:
-    """Return the next integral share and the spool command before its limit of +-1.
+    """
+    Return the next integral share and the spool command before its limit of +-1.
 
     ``reference`` and ``pressure`` in Pa, ``dt`` in s. An error that would push a saturated spool
     further out is not integrated.

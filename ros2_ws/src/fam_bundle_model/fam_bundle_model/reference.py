@@ -1,22 +1,35 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The strain to be tracked, as a function of time: every kind of waveform is one law.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The strain to be tracked, as a function of time: every kind of waveform is one law.
 
 A law is sines over polynomials. Before it begins it is at rest at its first strain, after its end
 at its last one. Harmonic kinds are ``a (1 - cos(phase))``, which begins at rest at zero; all
 others are polynomials of time of at most fifth degree, one piece after another.
 """
 
-import math
-import random
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+import math
+import random
 from typing import NamedTuple
-
-import numpy as np
-import numpy.typing as npt
 
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.parameters import ReferenceParameters, step_time
+import numpy as np
+import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Floats = float | Array
@@ -32,7 +45,8 @@ LEAST_JERK_RATE, LEAST_JERK_ACCELERATION = 15.0 / 8.0, 10.0 / math.sqrt(3.0)
 
 
 class Reference(NamedTuple):
-    """A trajectory; what lies before time zero of its own is the way to its beginning.
+    """
+    A trajectory; what lies before time zero of its own is the way to its beginning.
 
     ``start`` is that zero (s); from ``end`` (s after it) on its strain is held. The polynomials
     begin anew each ``cycle`` (s; infinite: never). ``sines`` holds a row of amplitude, frequency
@@ -146,7 +160,8 @@ def _steps(p: ReferenceParameters) -> Reference:
 
 
 def _minimum_jerk(p: ReferenceParameters) -> Reference:
-    """From rest to rest: of all ways the one with the least integral of the squared jerk.
+    """
+    From rest to rest: of all ways the one with the least integral of the squared jerk.
 
     Flash and Hogan, The Coordination of Arm Movements, J. Neurosci. 5(7), 1985.
     """
@@ -205,7 +220,8 @@ def _pieces(
 
 
 def quintic(start: Floats, rate: Floats, stop: Floats, final_rate: Floats, taken: Floats) -> Array:
-    """Return the coefficients of the way of least jerk that takes ``taken`` s: (..., 6).
+    """
+    Return the coefficients of the way of least jerk that takes ``taken`` s: (..., 6).
 
     From strain ``start`` to ``stop`` at the strain rates ``rate`` and ``final_rate`` (1/s) without
     acceleration at either end.
@@ -219,7 +235,8 @@ def quintic(start: Floats, rate: Floats, stop: Floats, final_rate: Floats, taken
 
 
 def smooth(times: Sequence[float], strains: Sequence[float]) -> Reference:
-    """Return the trajectory through ``strains`` at rising ``times`` (s), from rest to rest.
+    """
+    Return the trajectory through ``strains`` at rising ``times`` (s), from rest to rest.
 
     Strain rate and acceleration are continuous, and between two points it rises or falls
     throughout. Each point is passed without acceleration, at the smaller of the mean rates beside
@@ -261,7 +278,8 @@ def rate_of(law: Reference, time: float) -> float:
 def braked(
     before: Reference, time: float, acceleration: float, reach: tuple[float, float] = ANYWHERE
 ) -> Reference:
-    """Return ``before`` brought to rest from ``time`` s on, and held where it comes to rest.
+    """
+    Return ``before`` brought to rest from ``time`` s on, and held where it comes to rest.
 
     It is braked at ``acceleration`` (1/s^2), or as much harder as it takes to stay within
     ``reach``, the lowest and the highest strain.
@@ -285,7 +303,8 @@ def after(
     acceleration: float,
     reach: tuple[float, float] = ANYWHERE,
 ) -> Reference:
-    """Return ``wanted``, begun as soon as a way leads to its first strain from ``before``.
+    """
+    Return ``wanted``, begun as soon as a way leads to its first strain from ``before``.
 
     From ``time`` s on ``before`` is ``braked``; then the way of least jerk leads from rest to rest
     within ``rate`` (1/s) and ``acceleration`` (1/s^2). One polynomial for both would go far beyond

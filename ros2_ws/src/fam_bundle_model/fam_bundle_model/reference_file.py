@@ -1,8 +1,21 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """A strain reference from a CSV file."""
 
-import csv
 from collections.abc import Iterator
+import csv
 from pathlib import Path
 
 from fam_bundle_model.parameters import MOST_SAMPLES, ReferenceParameters
@@ -12,7 +25,8 @@ HEADER = ['time', 'strain']
 
 
 def read_samples(path: Path) -> tuple[list[float], list[float]]:
-    """Return the times (s) and strains in a CSV file with the header ``time,strain``.
+    """
+    Return the times (s) and strains in a CSV file with the header ``time,strain``.
 
     Rows are numbered as lines of the file; blank ones are passed over. Raises ConfigurationError
     naming file, row, value and bound.

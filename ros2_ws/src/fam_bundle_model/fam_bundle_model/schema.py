@@ -1,15 +1,29 @@
-# SPDX-License-Identifier: Apache-2.0
-"""How a parameter is declared: type, unit, range and one sentence, stated once.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+How a parameter is declared: type, unit, range and one sentence, stated once.
 
 A group is a frozen dataclass whose fields are made by ``number``, ``integer``, ``choice``,
 ``flag``, ``word``, ``per_unit`` or ``series``. Validation, the YAML loader, ROS parameter
 descriptors and the reference page all read the same declaration.
 """
 
+from collections.abc import Mapping
 import dataclasses
 import difflib
 import math
-from collections.abc import Mapping
 from typing import Any, TypeVar
 
 Group = TypeVar('Group')
@@ -21,7 +35,8 @@ class ConfigurationError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Declaration:
-    """What is known of one parameter besides its value.
+    """
+    What is known of one parameter besides its value.
 
     ``unit`` is an SI unit or empty; ``minimum`` and ``maximum`` bound the value, and
     ``exclusive`` says that the minimum itself is not allowed. ``kind`` is ``float``, ``int``,
@@ -161,7 +176,8 @@ def required(group: type) -> set[str]:
 
 
 def make_group(group: type[Group], name: str, values: Mapping[str, Any]) -> Group:
-    """Return ``group`` filled with validated ``values``.
+    """
+    Return ``group`` filled with validated ``values``.
 
     Raises ConfigurationError for an unknown or missing parameter, or a value out of its range.
     """

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Shared laws, and the FAM's equations transcribed a second time for the tests.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Shared laws, and the FAM's equations transcribed a second time for the tests.
 
 ``ExactFam`` states energies and volumes and lets scipy find the roots; it shares no code with
 ``fam_bundle_model``. Forces are derivatives of its energies by a complex step, which has no
@@ -9,14 +23,13 @@ truncation error to speak of.
 import dataclasses
 from pathlib import Path
 
-import numpy as np
-import pytest
-from scipy.optimize import brentq
-
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.fam import fam_law
 from fam_bundle_model.hydraulics import hydraulic_law
 from fam_bundle_model.parameters import FamParameters, load_configuration
+import numpy as np
+import pytest
+from scipy.optimize import brentq
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 HIGHEST_PRESSURE = 1.4e6
@@ -111,7 +124,8 @@ class ExactFam:
         )
 
     def collapse(self, pressure):
-        """Strain at which the buckled shape's mid-span moment reaches the collapse moment.
+        """
+        Strain at which the buckled shape's mid-span moment reaches the collapse moment.
 
         The shape's shortening is integrated numerically from its slope.
         """

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Compiled and interpreted code give the same bits.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Compiled and interpreted code give the same bits.
 
 This file runs itself a second time with FAM_BUNDLE_INTERPRET=1 and compares every number.
 """
@@ -7,16 +21,15 @@ This file runs itself a second time with FAM_BUNDLE_INTERPRET=1 and compares eve
 import dataclasses
 import json
 import os
+from pathlib import Path
 import subprocess
 import sys
 import tempfile
-from pathlib import Path
-
-import numpy as np
-import pytest
 
 from fam_bundle_model import bundle, compile, fam, hydraulics, lag_table, pressure_pi, reference
 from fam_bundle_model.parameters import KINDS, load_configuration
+import numpy as np
+import pytest
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 SAMPLES = 300

@@ -1,18 +1,30 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The gain at which a pressure loop rings against scipy's sampling of it; what is said of it."""
 
 import dataclasses
-
-import numpy as np
-import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.signal import cont2discrete
 
 from fam_bundle_model import fam
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.doubts import doubts, highest_loop_gain, ringing
 from fam_bundle_model.hydraulics import hydraulic_law, unit_flow
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete
 
 
 def change(configuration, **groups):

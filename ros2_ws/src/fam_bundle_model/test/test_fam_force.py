@@ -1,15 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The force law against virtual work, F = -dU/dx + P dV/dx at constant pressure, and scaling."""
 
 import math
 
-import numpy as np
-import pytest
+from fam_bundle_model import fam
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+import numpy as np
+import pytest
 from scipy.integrate import quad
-
-from fam_bundle_model import fam
 
 SCALE = 1e-6  # relative to the largest of the forces that cancel
 
@@ -65,7 +77,8 @@ def test_buckled_region_is_virtual_work_of_a_linearly_growing_load(make_fam, geo
 
 
 def collapsed_energy(exact, p):
-    """Return the energy (J) of a collapsed FAM over strain, counted from its collapse.
+    """
+    Return the energy (J) of a collapsed FAM over strain, counted from its collapse.
 
     Two rigid links turning by phi against springs k store k phi^2 (equation 4's F_c); what is left
     of the buckled force decays over beta.

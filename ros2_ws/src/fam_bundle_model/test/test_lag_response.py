@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The filling of one slack motor unit (Figure 6) against an independent integration.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The filling of one slack motor unit (Figure 6) against an independent integration.
 
 The reference integrates pressure, not oil: equation 7 with the compliance of the slack arc, by
 scipy's solve_ivp from tick to tick, the PI sampled at the ticks.
@@ -7,13 +21,12 @@ scipy's solve_ivp from tick to tick, the PI sampled at the ticks.
 
 import math
 
+from fam_bundle_model import fam
+from fam_bundle_model.lag_table import fill_response, REACHED
+from fam_bundle_model.pressure_pi import clamp, pressure_pi, PressureGains
 import numpy as np
 import pytest
 from scipy.integrate import simpson, solve_ivp
-
-from fam_bundle_model import fam
-from fam_bundle_model.lag_table import REACHED, fill_response
-from fam_bundle_model.pressure_pi import PressureGains, clamp, pressure_pi
 
 PERIOD = 0.001
 NO_TRACE = np.empty((0, 5))

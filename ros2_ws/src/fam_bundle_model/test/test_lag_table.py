@@ -1,18 +1,30 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The lag table: its shape, and its bilinear look-up."""
 
 import dataclasses
 import math
 
-import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
 from fam_bundle_model import fam
 from fam_bundle_model.bundle import motor_units
-from fam_bundle_model.lag_table import REACHED, LagTable, build_lag_table, fill_response, look_up
+from fam_bundle_model.lag_table import build_lag_table, fill_response, LagTable, look_up, REACHED
 from fam_bundle_model.pressure_pi import pressure_gains
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
 
 PLANE = LagTable(
     np.linspace(2e5, 7e5, 6),

@@ -1,11 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The configuration: every parameter declared, validated, hashed and written without loss."""
 
 import dataclasses
 import math
 import re
-
-import pytest
 
 from fam_bundle_model.parameters import (
     GROUPS,
@@ -15,6 +26,7 @@ from fam_bundle_model.parameters import (
     write_yaml,
 )
 from fam_bundle_model.schema import ConfigurationError, declarations
+import pytest
 
 EVERY = [(group, name) for group, kind in GROUPS.items() for name in declarations(kind)]
 # Ratios, counts and words; everything else has a unit.

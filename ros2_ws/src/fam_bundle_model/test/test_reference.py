@@ -1,22 +1,28 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Every kind of reference: where it begins and ends, its limits, its spectrum, what is smooth."""
 
 import dataclasses
 import itertools
 import math
 
-import numpy as np
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.optimize import minimize_scalar
-from scipy.signal import hilbert
-
 from fam_bundle_model.parameters import (
+    check_reference,
     CYCLIC,
     KINDS,
     ReferenceParameters,
-    check_reference,
     step_time,
 )
 from fam_bundle_model.reference import (
@@ -32,6 +38,12 @@ from fam_bundle_model.reference import (
     strain_reference,
 )
 from fam_bundle_model.schema import ConfigurationError
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+from scipy.signal import hilbert
 
 STEP = 1e-3
 SINE = ReferenceParameters('sine', 0.06, 0.1, 2)

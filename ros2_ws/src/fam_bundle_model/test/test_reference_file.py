@@ -1,13 +1,25 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """A reference from a CSV file: what is read, and that everything else is refused in one line."""
 
-import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
-
-from fam_bundle_model.parameters import MOST_SAMPLES, make_configuration, read_yaml
+from fam_bundle_model.parameters import make_configuration, MOST_SAMPLES, read_yaml
 from fam_bundle_model.reference_file import read_samples
 from fam_bundle_model.schema import ConfigurationError
+from hypothesis import given, HealthCheck, settings
+from hypothesis import strategies as st
+import pytest
 
 HEAD = 'time,strain\n'
 shared_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])

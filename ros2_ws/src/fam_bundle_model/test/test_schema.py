@@ -1,16 +1,25 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Declarations of parameters: what they accept, and what they say when they do not."""
 
-import math
 from dataclasses import dataclass
-
-import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+import math
 
 from fam_bundle_model.schema import (
-    ConfigurationError,
     choice,
+    ConfigurationError,
     declarations,
     integer,
     make_group,
@@ -20,6 +29,9 @@ from fam_bundle_model.schema import (
     required,
     word,
 )
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import pytest
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Which samples have been answered: judges every command by its tick. Pure Python.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Which samples have been answered: judges every command by its tick. Pure Python.
 
 Owned by whoever takes the samples, the plant simulator or the hardware bridge.
 """
@@ -22,7 +36,8 @@ class Answers:
         self.sample = self.answered = -1
 
     def admit(self, tick: int) -> bool:
-        """Return whether a command answers a sample that waits for it, and count it if not.
+        """
+        Return whether a command answers a sample that waits for it, and count it if not.
 
         Raises TickError for one that nothing can explain, in lock-step for every other one.
         """

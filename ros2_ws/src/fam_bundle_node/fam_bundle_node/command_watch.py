@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Decides whether the valves may follow the newest command. Pure Python.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Decides whether the valves may follow the newest command. Pure Python.
 
 Owned by whoever has the valves, the plant simulator or the hardware bridge.
 """
@@ -8,14 +22,16 @@ from collections import deque
 
 
 class CommandWatch:
-    """Safe while commands stay away; latched after a fault.
+    """
+    Safe while commands stay away; latched after a fault.
 
     Counts samples first, so that a schedule which was itself held up does not blame the
     controllers; but valves that stay on one command for twice the time are safe in any case.
     """
 
     def __init__(self, limit: int) -> None:
-        """Go safe when the newest answer is ``limit`` samples old; ``limit`` is 2 or more.
+        """
+        Go safe when the newest answer is ``limit`` samples old; ``limit`` is 2 or more.
 
         Answers that keep coming for as many samples, never a fifth of it apart, end it. Not safe
         at first: its owner begins when the loop has closed.

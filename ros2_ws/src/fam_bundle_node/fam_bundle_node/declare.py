@@ -1,18 +1,31 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """ROS parameters from the one schema of ``fam_bundle_model.parameters``."""
 
 from collections.abc import Iterable
 from typing import Any
 
+from fam_bundle_model.parameters import Configuration, GROUPS, make_configuration
+from fam_bundle_model.schema import ConfigurationError, Declaration, declarations, unknown
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
 
-from fam_bundle_model.parameters import GROUPS, Configuration, make_configuration
-from fam_bundle_model.schema import ConfigurationError, Declaration, declarations, unknown
-
 
 def declare_configuration(node: Node, groups: Iterable[str]) -> Configuration:
-    """Declare the parameters of ``groups`` as ``group.name`` and return their configuration.
+    """
+    Declare the parameters of ``groups`` as ``group.name`` and return their configuration.
 
     Raises ConfigurationError naming the parameter, its value and the bound.
     """

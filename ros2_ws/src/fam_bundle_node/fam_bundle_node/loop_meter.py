@@ -1,10 +1,23 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """How well a node keeps up: rate, latencies, CPU time, and what went wrong. No ROS."""
 
-import math
-import time
 from collections import Counter
 from collections.abc import Callable
+import math
+import time
 from typing import NamedTuple
 
 from fam_bundle_node.ticks import TickCounts
@@ -76,7 +89,8 @@ class LoopMeter:
         return age if self._comparable else None
 
     def answered(self, tick: int, steady_time: int) -> None:
-        """Count a tick whose sample was taken at ``steady_time`` (ns).
+        """
+        Count a tick whose sample was taken at ``steady_time`` (ns).
 
         Tick 0 has no latency: it waits until the loop has closed.
         """
@@ -133,7 +147,8 @@ class LoopMeter:
 
 
 def quantile(ordered: list[int], share: float) -> float:
-    """Return the value that ``share`` of the ``ordered`` ones do not exceed, or NaN of none.
+    """
+    Return the value that ``share`` of the ``ordered`` ones do not exceed, or NaN of none.
 
     Interpolates linearly between two ranks.
     """

@@ -1,16 +1,23 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What every node of the loop shares: parameters, admission of messages, statistics, errors."""
 
+from collections.abc import Callable, Iterable
 import re
 import time
-from collections.abc import Callable, Iterable
 from typing import Any
-
-from rclpy.duration import Duration
-from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.node import Node
-from rclpy.publisher import Publisher
-from rclpy.task import Future
 
 from fam_bundle_model.parameters import Configuration
 from fam_bundle_model.schema import ConfigurationError
@@ -23,10 +30,15 @@ from fam_bundle_node.qos import (
     REALTIME_PUBLISHER,
     REALTIME_SUBSCRIPTION,
 )
-from fam_bundle_node.stamps import StampClock, begins_anew
+from fam_bundle_node.stamps import begins_anew, StampClock
 from fam_bundle_node.statistics_publisher import StatisticsPublisher
 from fam_bundle_node.steady_timer import SteadyTimer
 from fam_bundle_node.ticks import Strikes, TickCounts, TickError, TickFilter, TickOrder
+from rclpy.duration import Duration
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.task import Future
 
 RCLError = rclpy_implementation.RCLError
 # Parameter groups that every node of the loop declares.
@@ -41,7 +53,8 @@ FUTURE = -1_000_000  # ns; a sample that is stamped further ahead than this was 
 
 
 class LoopNode(Node):
-    """A node that publishes and consumes one message per tick.
+    """
+    A node that publishes and consumes one message per tick.
 
     In lock-step a message that is missing, out of order or bad ends the node. In real time it is
     counted and dropped, and three close together are a trouble until they have ceased.
@@ -80,7 +93,8 @@ class LoopNode(Node):
         return publisher
 
     def deliver(self) -> None:
-        """Wait until everybody has all that this node has published to the loop.
+        """
+        Wait until everybody has all that this node has published to the loop.
 
         A recorder may be behind.
         """
@@ -230,7 +244,8 @@ class Controller(LoopNode):
         raise NotImplementedError
 
     def time_step(self, sample: Any) -> float:
-        """Return the time in s since the last sample; restart the law where that has no meaning.
+        """
+        Return the time in s since the last sample; restart the law where that has no meaning.
 
         Raises TickError when time stands still.
         """

@@ -1,13 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
-"""What paces the owner of the plant: each other, a steady clock, or the hardware.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What paces the owner of the plant: each other, a steady clock, or the hardware.
 
 Pure Python. A pacing calls ``step(periods)`` for every tick; ``periods`` is 1, or more when it
 was held up: it skips what it missed and never fires back to back to catch up.
 """
 
+from collections.abc import Callable
 import threading
 import time
-from collections.abc import Callable
 from typing import Protocol
 
 Clock = Callable[[], int]
@@ -22,7 +36,8 @@ class Pacing(Protocol):
     due: int | None
 
     def start(self, step: Step, failed: Callable[[BaseException], None]) -> None:
-        """Begin to call ``step``.
+        """
+        Begin to call ``step``.
 
         A pacing with a thread of its own tells ``failed`` what a step raised and ends; one
         without lets it rise to whoever called.
@@ -49,7 +64,8 @@ class Schedule:
         return self._origin + (self._done + 1) * self._period
 
     def take(self, now: int) -> int:
-        """Return how many periods have come due by ``now`` (ns), at least 1; be done with them.
+        """
+        Return how many periods have come due by ``now`` (ns), at least 1; be done with them.
 
         More than 1 after an overrun. The next due time then lies after ``now``.
         """
@@ -138,7 +154,8 @@ class Periodic(_Threaded):
         clock: Clock = time.monotonic_ns,
         sleep: Sleep = time.sleep,
     ) -> None:
-        """Step every ``period`` ns, the last ``busy_tail`` ns of each wait spent awake.
+        """
+        Step every ``period`` ns, the last ``busy_tail`` ns of each wait spent awake.
 
         The first step is due one period after ``start``.
         """

@@ -1,10 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The trajectory to and from its message, to the bit."""
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
 
-import numpy as np
+"""The trajectory to and from its message, to the bit."""
 
 from fam_bundle_model.reference import ORDER, Reference
 from fam_bundle_msgs.msg import Reference as ReferenceMessage
+import numpy as np
 
 
 def to_message(law: Reference, kind: str) -> ReferenceMessage:
@@ -21,7 +33,8 @@ def to_message(law: Reference, kind: str) -> ReferenceMessage:
 
 
 def from_message(message: ReferenceMessage) -> Reference:
-    """Return the trajectory in ``message``.
+    """
+    Return the trajectory in ``message``.
 
     Raises ValueError when its parts do not fit, or where it has no strain at some time.
     """

@@ -1,18 +1,30 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Runs nodes of the loop in this process until they are done: executor, tuning, exit status."""
 
+from collections.abc import Callable, Sequence
 import sys
 import time
-from collections.abc import Callable, Sequence
-
-import rclpy
-from rclpy.executors import Executor, ExternalShutdownException
-from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.task import Future
 
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.loop_node import LoopNode
 from fam_bundle_node.tuning import tune
+import rclpy
+from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.task import Future
 
 INTERRUPTED = 130
 SIGNAL_TIME = 0.2  # s between a callback that a signal cuts short and the end of the context
@@ -38,7 +50,8 @@ def run_node(make_node: Callable[[], LoopNode]) -> int:
 
 
 def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
-    """Run nodes on one executor until the first is done or told to stop; return its exit status.
+    """
+    Run nodes on one executor until the first is done or told to stop; return its exit status.
 
     0 when it has done its work, 1 after a failure, 2 for a bad configuration, 130 when it was told
     to stop before.

@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Times and time steps from the stamps of messages. Pure Python."""
 
 from typing import Protocol
@@ -20,7 +33,8 @@ def nanoseconds(stamp: Stamp) -> int:
 
 
 def begins_anew(tick: int, safe: bool, gap: float, timeout: float) -> bool:
-    """Return whether a law starts again at a sample that came ``gap`` s after the one before.
+    """
+    Return whether a law starts again at a sample that came ``gap`` s after the one before.
 
     At the start of a run, while the plant is safe, for a law whose output is not applied must not
     wind up, and where the time between has no meaning: it went back, or is beyond ``timeout`` s.

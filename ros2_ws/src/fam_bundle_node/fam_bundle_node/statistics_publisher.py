@@ -1,15 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Publishes a node's loop statistics, and the same on /diagnostics (REP-107)."""
 
 import dataclasses
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.node import Node
-
 from fam_bundle_msgs.msg import LoopStatistics
 from fam_bundle_node.loop_meter import LoopMeter
 from fam_bundle_node.qos import REPORTS
 from fam_bundle_node.ticks import TickCounts
+from rclpy.node import Node
 
 
 class StatisticsPublisher:

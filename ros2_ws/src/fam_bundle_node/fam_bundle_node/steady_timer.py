@@ -1,14 +1,28 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """A timer that no step of the system clock can hold up."""
 
-import threading
 from collections.abc import Callable
+import threading
 
 from rclpy.node import Node
 
 
 class SteadyTimer:
-    """Calls back in the executor of a node, woken by a thread of its own.
+    """
+    Calls back in the executor of a node, woken by a thread of its own.
 
     The executor's own timers wait on the system clock where it was built with an old C library,
     whatever clock they are of: one that is set back by an hour silences them for that hour.
@@ -21,7 +35,8 @@ class SteadyTimer:
         callback: Callable[[], None],
         failed: Callable[[Exception], None],
     ) -> None:
-        """Call ``callback`` every ``period`` s while the node has an executor.
+        """
+        Call ``callback`` every ``period`` s while the node has an executor.
 
         ``failed`` gets what it raises, which the executor would keep to itself.
         """

@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """An action whose goals are executed from tick to tick."""
 
 from collections.abc import Callable
@@ -10,7 +23,8 @@ from rclpy.node import Node
 
 
 class TickedAction(ActionServer):
-    """An action server whose node itself executes a goal, in the callbacks of the loop.
+    """
+    An action server whose node itself executes a goal, in the callbacks of the loop.
 
     As a task that waits for its end a goal would be polled between all callbacks: rclpy has no
     other way to wait, and it would hold the loop up.

@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Ticks arithmetic: what belongs together, what is missing, twice or late. Pure Python."""
 
 from collections.abc import Iterable
@@ -53,7 +66,8 @@ class TickFilter:
         self._seen = 0
 
     def admit(self, tick: int) -> bool:
-        """Return whether ``tick`` is to be used.
+        """
+        Return whether ``tick`` is to be used.
 
         A jump, back or far ahead, is believed when ``CONFIRMED`` rising ticks in a row say so:
         one stray message must not blind the loop to all that follow. Tick 0 begins a new run.
@@ -86,7 +100,8 @@ class TickJoin:
         self._done: int | None = None
 
     def _is_new_run(self, topic: str, tick: int) -> bool:
-        """Return whether a tick that has been there begins a new run: tick 0 on any topic.
+        """
+        Return whether a tick that has been there begins a new run: tick 0 on any topic.
 
         And any tick on the first topic, whose ticks were checked before.
         """
@@ -96,7 +111,8 @@ class TickJoin:
         return topic == self._topics[0] and self._done is not None and tick < self._done
 
     def add(self, topic: str, message: Any) -> tuple[Any, ...] | None:
-        """Return the messages of a tick in the order of the topics once all are there.
+        """
+        Return the messages of a tick in the order of the topics once all are there.
 
         A message of a tick that is done with, or that was there before, is counted and dropped;
         tick 0 begins a new run.

@@ -1,16 +1,30 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Asks the system for what helps a loop to keep time; a refusal is a warning, never a failure.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Asks the system for what helps a loop to keep time; a refusal is a warning, never a failure.
 
 Linux. Scheduling is set for every thread of the process, for the middleware's exist before the
 nodes know their parameters.
 """
 
+from collections.abc import Callable
 import contextlib
 import ctypes
 import errno
 import gc
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 from fam_bundle_model.parameters import ProcessParameters
@@ -33,7 +47,8 @@ def set_policy(policy: int, priority: int = 0) -> None:
 
 
 def set_batch_policy() -> None:
-    """Let nobody whom this process wakes pre-empt it: a fifth more ticks per second in lock-step.
+    """
+    Let nobody whom this process wakes pre-empt it: a fifth more ticks per second in lock-step.
 
     Else a publisher is put aside by its first reader before it has served the others. It needs
     no rights. Raises OSError when the system refuses.
@@ -58,7 +73,8 @@ def lock_memory() -> None:
 
 
 def set_timer_slack(slack: float) -> None:
-    """Let the kernel wake this thread, and those it starts, at most ``slack`` s late.
+    """
+    Let the kernel wake this thread, and those it starts, at most ``slack`` s late.
 
     Raises OSError when the system refuses.
     """

@@ -1,15 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """A message that holds what cannot be is refused before anything uses it."""
 
+from array import array
 import copy
 import math
-from array import array
 from types import SimpleNamespace
 
-import pytest
-
-from fam_bundle_node.checks import CHECKS, check_finite, check_length
+from fam_bundle_node.checks import check_finite, check_length, CHECKS
 from fam_bundle_node.ticks import TickError
+import pytest
 
 UNITS = 2
 # For each topic a message as it should be, with what a consumer of the loop uses.

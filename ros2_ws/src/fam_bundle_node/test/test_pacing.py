@@ -1,15 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Steps keep to an absolute schedule, skip what they missed, and end when they are told to."""
 
 import itertools
 import random
 import threading
 
-import pytest
+from fam_bundle_node.pacing import Blocking, Lockstep, Periodic, Schedule, wait_until
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from fam_bundle_node.pacing import Blocking, Lockstep, Periodic, Schedule, wait_until
+import pytest
 
 PERIOD = 1_000_000  # ns
 HANG = 60.0  # s; only a test that has failed waits so long
@@ -34,7 +46,8 @@ class World:
 
 
 def paced(world, work, busy_tail=0):
-    """Return when, for which due time and after how many periods each step is taken.
+    """
+    Return when, for which due time and after how many periods each step is taken.
 
     ``work`` is how long each of the steps takes.
     """

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The simulated rig: source, valves, hoses, bundle and hanging load.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The simulated rig: source, valves, hoses, bundle and hanging load.
 
 The oil content of each unit is a state and its pressure follows from it, so that oil is conserved
 to rounding. Integrated by the classical Runge-Kutta method at a fixed number of sub-steps.
@@ -8,19 +22,18 @@ to rounding. Integrated by the classical Runge-Kutta method at a fixed number of
 import math
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from fam_bundle_model import fam
-from fam_bundle_model.bundle import MotorUnit, balancing_pressure, motor_units
+from fam_bundle_model.bundle import balancing_pressure, motor_units, MotorUnit
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.hydraulics import (
-    HydraulicLaw,
     hydraulic_law,
+    HydraulicLaw,
     source_pressure_rate,
     unit_flow,
 )
-from fam_bundle_model.parameters import GRAVITY, Configuration
+from fam_bundle_model.parameters import Configuration, GRAVITY
+import numpy as np
+import numpy.typing as npt
 
 # Layout of the state vector; then the oil of one FAM (m^3) and the spool of each unit.
 STRAIN, STRAIN_RATE, SOURCE_PRESSURE, UNITS = 0, 1, 2, 3

@@ -1,12 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """ROS node of the simulated rig: valve_command in, bundle_state out; it paces the graph."""
 
 import sys
 import threading
 import time
-
-import numpy as np
-from std_srvs.srv import Trigger
 
 from fam_bundle_model.compile import direct
 from fam_bundle_model.hydraulics import TO_TANK
@@ -20,6 +30,8 @@ from fam_bundle_node.run import run_node
 from fam_bundle_node.steady_timer import SteadyTimer
 from fam_bundle_sim.plant import plant, plant_step, resting_state, truth
 from fam_bundle_sim.sensors import measure, noise_samples, sensors
+import numpy as np
+from std_srvs.srv import Trigger
 
 GROUPS = (
     'fam',
@@ -46,7 +58,8 @@ def make_pacing(configuration: Configuration) -> Pacing:
 
 
 class PlantSimulator(LoopNode):
-    """Takes a step when its pacing says so, under the newest valve command.
+    """
+    Takes a step when its pacing says so, under the newest valve command.
 
     Tick 0 is published once everybody listens; its answer proves the loop closed and starts the
     pacing. The node ends by itself after the run's last tick.

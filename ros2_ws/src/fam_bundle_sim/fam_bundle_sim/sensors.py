@@ -1,15 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Simulated sensors: seeded noise and finite resolution on top of the true values."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
 from fam_bundle_model.compile import compiled
 from fam_bundle_model.parameters import SensorParameters
 from fam_bundle_sim.plant import Truth
+import numpy as np
+import numpy.typing as npt
 
 CHANNELS = 4  # strain, force, source pressure, source flow; then one pressure per unit
 _BLOCK = 1000
@@ -58,7 +70,8 @@ def measure(
     sample: npt.NDArray[np.float64],
     mu_pressure: npt.NDArray[np.float64],
 ) -> Truth:
-    """Return what the sensors read for ``true``, and turn ``mu_pressure`` (units,) into readings.
+    """
+    Return what the sensors read for ``true``, and turn ``mu_pressure`` (units,) into readings.
 
     ``sample`` is one standard normal value per channel.
     """

@@ -1,23 +1,36 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The simulated rig behind a simulated card: the plant, seen and moved in volts only.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The simulated rig behind a simulated card: the plant, seen and moved in volts only.
 
 It fulfils the protocol of the hardware bridge (``fam_bundle_io.hardware.backend``) by structure:
 errors are OSError with a code and words. Deterministic: the same calls give the same volts.
 """
 
+from collections.abc import Callable
 import dataclasses
 import time
-from collections.abc import Callable
 from typing import Any, Protocol
-
-import numpy as np
-import numpy.typing as npt
 
 from fam_bundle_model.compile import direct
 from fam_bundle_model.hydraulics import TO_TANK
 from fam_bundle_model.schema import choice, flag, integer, make_group, number
 from fam_bundle_sim.plant import Plant, plant, plant_step, resting_state, truth
 from fam_bundle_sim.sensors import CHANNELS, measure, noise_samples, sensors
+import numpy as np
+import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
@@ -101,7 +114,8 @@ class VoltsBackend:
     # ---- The protocol ----
 
     def configure(self, setup: Any) -> None:
-        """Open the card and put the safe volts out; the plant goes on from where it is.
+        """
+        Open the card and put the safe volts out; the plant goes on from where it is.
 
         Raises ConfigurationError for options that cannot be, OSError without a configuration.
         """
@@ -170,7 +184,8 @@ class VoltsBackend:
     # ---- What breaks ----
 
     def inject(self, fault: str, *channels: int) -> None:
-        """Break it: one of FAULTS, at input or output ``channels`` in the setup's order.
+        """
+        Break it: one of FAULTS, at input or output ``channels`` in the setup's order.
 
         Raises ValueError for a fault or a channel that does not exist.
         """

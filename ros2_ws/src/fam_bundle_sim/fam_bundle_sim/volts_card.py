@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The simulated rig behind a simulated card in a process of its own, which outlives the bridge.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The simulated rig behind a simulated card in a process of its own, which outlives the bridge.
 
 The process runs plant and watchdog on the steady clock, whether or not anybody reads, and keeps a
 log of what is out. ``VoltsCard`` is the backend ``volts_card``: it talks to that process through
@@ -11,20 +25,19 @@ import argparse
 import dataclasses
 import itertools
 import os
+from pathlib import Path
 import pickle
 import select
 import socket
 import sys
 import time
-from pathlib import Path
 from typing import Any
-
-import numpy as np
-import numpy.typing as npt
 
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_sim.sensors import CHANNELS
-from fam_bundle_sim.volts_backend import VoltsBackend, check_volts
+from fam_bundle_sim.volts_backend import check_volts, VoltsBackend
+import numpy as np
+import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
@@ -34,7 +47,8 @@ NO_SAMPLE = 110  # code of a read that times out
 
 
 def log_type(units: int) -> np.dtype[np.void]:
-    """Return the type of a row of the log: what was so from ``time`` on (ns, steady).
+    """
+    Return the type of a row of the log: what was so from ``time`` on (ns, steady).
 
     ``event`` is ``sample`` for each period, ``read`` where a sample was taken, ``expire`` for the
     watchdog, ``gone`` for a client that is no more, else the call. ``outputs`` (units,) and
@@ -71,7 +85,8 @@ class VoltsCard:
         self._setup: Any = None
 
     def configure(self, setup: Any) -> None:
-        """Connect to the card and open it.
+        """
+        Connect to the card and open it.
 
         Raises ConfigurationError for options that cannot be, OSError where no card listens.
         """

@@ -1,21 +1,34 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Compiled and interpreted plant and sensors give the same bits over an open-loop run.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Compiled and interpreted plant and sensors give the same bits over an open-loop run.
 
 This file runs itself a second time with FAM_BUNDLE_INTERPRET=1 and compares every number.
 """
 
 import json
 import os
+from pathlib import Path
 import subprocess
 import sys
-from pathlib import Path
-
-import numpy as np
 
 from fam_bundle_model import compile
-from fam_bundle_model.parameters import SensorParameters, load_configuration
+from fam_bundle_model.parameters import load_configuration, SensorParameters
 from fam_bundle_sim.plant import plant, plant_step, resting_state, truth
 from fam_bundle_sim.sensors import measure, noise_samples, sensors
+import numpy as np
 
 CONFIGURATION = Path(__file__).parents[2] / 'fam_bundle_bringup' / 'config' / 'lhacd.yaml'
 

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""What the plant conserves: oil, and power where the force law has an energy.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What the plant conserves: oil, and power where the force law has an energy.
 
 The force law has an energy at constant pressure in every region (fam_bundle_model's tests), and
 while a FAM is straight also over changing pressure: the bladder's. Past the buckling strain
@@ -13,14 +27,13 @@ those with slack units the part done by the straight ones.
 import itertools
 import math
 
-import numpy as np
-import pytest
-from scipy.integrate import quad, simpson
-
 from fam_bundle_model import fam
 from fam_bundle_model.hydraulics import unit_flow
 from fam_bundle_model.parameters import GRAVITY
 from fam_bundle_sim.plant import plant_step, resting_state, truth
+import numpy as np
+import pytest
+from scipy.integrate import quad, simpson
 
 FINE = 1.25e-4  # s
 

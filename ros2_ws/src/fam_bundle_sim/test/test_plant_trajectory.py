@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The plant's trajectory against an independent right-hand side and scipy's stiff integrator.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The plant's trajectory against an independent right-hand side and scipy's stiff integrator.
 
 The reference has the pressures as states (equation 7); the plant has the oil contents. For a
 slack FAM the reference's volume changes with its own pressure, V'(e_b) de_b/dP.
@@ -8,13 +22,12 @@ slack FAM the reference's volume changes with its own pressure, V'(e_b) de_b/dP.
 import dataclasses
 import math
 
-import numpy as np
-import pytest
-from scipy.integrate import solve_ivp
-
 from fam_bundle_model import fam
 from fam_bundle_model.parameters import GRAVITY
 from fam_bundle_sim.plant import plant_step, resting_state, truth
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
 
 PERIOD = 0.001
 

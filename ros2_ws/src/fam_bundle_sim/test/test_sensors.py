@@ -1,16 +1,28 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Sensors: exact when ideal, reproducible by seed, of the stated noise and resolution."""
 
 import itertools
-
-import numpy as np
-import pytest
-from scipy import stats
 
 from fam_bundle_model.parameters import SensorParameters
 from fam_bundle_sim import sensors as module
 from fam_bundle_sim.plant import Truth
 from fam_bundle_sim.sensors import CHANNELS, measure, noise_samples, sensors
+import numpy as np
+import pytest
+from scipy import stats
 
 TRUE = Truth(0.0623, 184.4, 655.3e3, 4.2e-5)
 PRESSURES = (301.7e3, 12.3)

@@ -1,19 +1,31 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The simulated rig in volts: what wires, converters, amplifiers and valves make of it."""
 
 import dataclasses
 import itertools
-import time
 from pathlib import Path
-
-import numpy as np
-import pytest
-from scipy import stats
+import time
 
 from fam_bundle_io.hardware.backend import make_setup
 from fam_bundle_io.hardware.calibration import load_hardware
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_sim.volts_backend import FAULTS, VoltsBackend
+import numpy as np
+import pytest
+from scipy import stats
 
 PERIOD = 0.001
 SAFE = -9.375

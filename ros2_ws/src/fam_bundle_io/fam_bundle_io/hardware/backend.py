@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The protocol of a card: volts in, volts out, a watchdog, a safe state. How to find a backend.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The protocol of a card: volts in, volts out, a watchdog, a safe state. How to find a backend.
 
 Order of the calls::
 
@@ -9,17 +23,16 @@ Order of the calls::
 Only ``arm`` lets a valve move, and ``make_safe`` takes that back. All calls come from one thread.
 """
 
+from collections.abc import Mapping
 import dataclasses
 import importlib.metadata
 import time
-from collections.abc import Mapping
-from typing import Any, Protocol, cast
-
-import numpy as np
-import numpy.typing as npt
+from typing import Any, cast, Protocol
 
 from fam_bundle_io.hardware.calibration import Calibration, HardwareFile, Scaling
 from fam_bundle_model.parameters import Configuration
+import numpy as np
+import numpy.typing as npt
 
 GROUP = 'fam_bundle.backends'
 FLOATS = np.dtype(np.float64)
@@ -28,7 +41,8 @@ Volts = npt.NDArray[np.float64]
 
 
 class BackendError(OSError):
-    """A card that refuses or fails.
+    """
+    A card that refuses or fails.
 
     ``errno`` is the vendor's code (0 without one), ``strerror`` its words. A backend that cannot
     import this class raises a plain OSError with the same two.
@@ -45,7 +59,8 @@ class BackendError(OSError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Setup:
-    """What a card is to do; ``make_setup`` makes it.
+    """
+    What a card is to do; ``make_setup`` makes it.
 
     Channels come in the order of ``Calibration.sensors()`` and of its valves; ``safe_volts``
     (outputs,) open every motor unit to the tank. ``period`` and the timeouts are in s.
@@ -75,7 +90,8 @@ def make_setup(
     period: float,
     configuration: Configuration | None = None,
 ) -> Setup:
-    """Return what the card of ``backend`` is to do, with a sample every ``period`` s.
+    """
+    Return what the card of ``backend`` is to do, with a sample every ``period`` s.
 
     ``configuration`` is what a simulated rig simulates.
     """
@@ -101,7 +117,8 @@ def make_setup(
 
 
 class Backend(Protocol):
-    """A card. Every call may raise BackendError.
+    """
+    A card. Every call may raise BackendError.
 
     Arrays are float64, C-contiguous and the caller's.
 
@@ -110,7 +127,8 @@ class Backend(Protocol):
     """
 
     def configure(self, setup: Setup) -> None:
-        """Open the card, or open it anew, and put the safe volts out.
+        """
+        Open the card, or open it anew, and put the safe volts out.
 
         Clears an expired watchdog and tells it the safe volts; the watchdog does not run yet. A
         card that cannot hold the safe volts by itself after expiry is refused. Options that
@@ -121,7 +139,8 @@ class Backend(Protocol):
         """Start the watchdog; from here on ``write`` is allowed."""
 
     def read(self, volts: Volts) -> None:
-        """Wait for the next sample of all inputs and fill ``volts`` (inputs,): this is the pace.
+        """
+        Wait for the next sample of all inputs and fill ``volts`` (inputs,): this is the pace.
 
         Raises BackendError when no sample comes in time, where the vendor's call can tell.
         """
@@ -130,27 +149,31 @@ class Backend(Protocol):
         """Put ``volts`` (outputs,) out. Refused unless armed."""
 
     def reload_watchdog(self) -> bool:
-        """Give the watchdog its full time again; False: it had expired before.
+        """
+        Give the watchdog its full time again; False: it had expired before.
 
         Refused unless armed.
         """
 
     def make_safe(self) -> None:
-        """Put the safe volts out and disarm. May be called in any state and any number of times.
+        """
+        Put the safe volts out and disarm. May be called in any state and any number of times.
 
         The watchdog is stopped only when the safe volts are known to be out: where they cannot be
         written it runs on, so that its expiry puts them out. Raises BackendError in that case.
         """
 
     def close(self) -> None:
-        """Put the safe volts out and let go of the card. Never refused.
+        """
+        Put the safe volts out and let go of the card. Never refused.
 
         Where they cannot be written it waits for the watchdog to bring them.
         """
 
 
 def check_volts(call: str, volts: Volts, size: int) -> None:
-    """Raise BackendError unless ``volts`` is what vendors' wrappers take without checking it.
+    """
+    Raise BackendError unless ``volts`` is what vendors' wrappers take without checking it.
 
     They hand on the address of the buffer: whole numbers, or every second element of a larger
     array, would be read as garbage.
@@ -165,7 +188,8 @@ def check_volts(call: str, volts: Volts, size: int) -> None:
 
 
 class Card:
-    """What all our cards share: the order of the calls and the buffers are checked here.
+    """
+    What all our cards share: the order of the calls and the buffers are checked here.
 
     A subclass fills in the calls that begin with an underscore; it may rely on the order.
     """
@@ -272,7 +296,8 @@ def backend_names() -> list[str]:
 
 
 def load_backend(name: str) -> Backend:
-    """Return a new backend, found by its entry point in the group ``fam_bundle.backends``.
+    """
+    Return a new backend, found by its entry point in the group ``fam_bundle.backends``.
 
     Raises BackendError for a name that nobody registered, with those that exist, and where its
     module cannot be imported. A vendor's package is imported by ``configure``, not here.

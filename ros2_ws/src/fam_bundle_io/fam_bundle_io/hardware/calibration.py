@@ -1,27 +1,38 @@
-# SPDX-License-Identifier: Apache-2.0
-"""What volts mean: the calibration of every sensor and valve, its file, and the scaling.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+What volts mean: the calibration of every sensor and valve, its file, and the scaling.
 
 A sensor reads ``gain (volts - offset)``. A valve's spool s is put out as ``null +- span |s|``
 beyond its dead band, with the sign that the wiring asks for. SI units and volts throughout.
 """
 
+from collections.abc import Mapping
 import dataclasses
+from dataclasses import dataclass
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
-
-import numpy as np
-import numpy.typing as npt
 
 from fam_bundle_io.hardware.limits import Limits, make_limits
 from fam_bundle_model.files import whole_file
 from fam_bundle_model.hydraulics import TO_TANK
 from fam_bundle_model.schema import (
-    ConfigurationError,
     choice,
+    ConfigurationError,
     integer,
     make_group,
     number,
@@ -29,6 +40,8 @@ from fam_bundle_model.schema import (
     unknown,
     word,
 )
+import numpy as np
+import numpy.typing as npt
 
 Volts = npt.NDArray[np.float64]
 Values = npt.NDArray[np.float64]
@@ -76,7 +89,8 @@ class SensorCalibration(_Sensor):
 
 @dataclass(frozen=True, kw_only=True)
 class FlowCalibration(_Sensor):
-    """A flow meter that gives pulses, behind a frequency-to-voltage converter.
+    """
+    A flow meter that gives pulses, behind a frequency-to-voltage converter.
 
     Its frequency in Hz is ``pulses_per_litre`` times the flow in L/s.
     """
@@ -141,7 +155,8 @@ class Calibration:
 
 
 class Scaling:
-    """Turns volts into SI values and spools into volts, and back, without new arrays.
+    """
+    Turns volts into SI values and spools into volts, and back, without new arrays.
 
     Volts to a value and back differ by at most ``2 u (2 |volts - offset| + |volts|)``, u = 2^-53:
     three roundings on the difference, and one on the result. ``safe_volts`` (valves,) command
@@ -192,7 +207,8 @@ class Scaling:
 
 
 def zeroed(calibration: Calibration, volts: Mapping[int, float]) -> Calibration:
-    """Return ``calibration`` with offsets by which the inputs in ``volts`` read their zero value.
+    """
+    Return ``calibration`` with offsets by which the inputs in ``volts`` read their zero value.
 
     ``volts`` holds the mean in V of each input that was measured while every unit was vented.
     """
@@ -226,7 +242,8 @@ class HardwareFile:
 
 
 def make_calibration(values: Mapping[str, Any]) -> Calibration:
-    """Return the calibration of ``values``: ``id``, ``sensors`` and ``valves``.
+    """
+    Return the calibration of ``values``: ``id``, ``sensors`` and ``valves``.
 
     Raises ConfigurationError naming the parameter, its value and the bound.
     """
@@ -346,7 +363,8 @@ def _check_channels(calibration: Calibration) -> None:
 
 
 def load_hardware(path: Path) -> HardwareFile:
-    """Return the rig in the YAML file ``path``.
+    """
+    Return the rig in the YAML file ``path``.
 
     Its groups are ``id``, ``sensors``, ``valves``, ``limits`` (may be left out) and ``backends``
     (options by backend, may be left out). Raises ConfigurationError with a message that starts
@@ -380,7 +398,8 @@ def _make_hardware(content: Mapping[str, Any]) -> HardwareFile:
 
 
 def write_hardware(hardware: HardwareFile, path: Path) -> None:
-    """Write a rig so that ``load_hardware`` gives the same one; whole or not at all.
+    """
+    Write a rig so that ``load_hardware`` gives the same one; whole or not at all.
 
     Comments of the file that it came from are lost.
     """

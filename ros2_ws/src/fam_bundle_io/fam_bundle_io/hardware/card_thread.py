@@ -1,19 +1,31 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The one thread that owns the card: ticks, runs, and what others ask of it. No ROS."""
 
-import queue
-import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswer  # another one than TimeoutError in 3.10
+import queue
+import threading
+import time
 from typing import Any, NamedTuple, TypeVar
-
-import numpy as np
-import numpy.typing as npt
 
 from fam_bundle_io.hardware.monitor import Monitor, Sample
 from fam_bundle_io.hardware.safety import State
+import numpy as np
+import numpy.typing as npt
 
 T = TypeVar('T')
 
@@ -22,7 +34,8 @@ SLICE = 0.2  # s after which a wait looks around
 
 
 class Hooks(NamedTuple):
-    """What the thread tells its owner; each is called in the thread.
+    """
+    What the thread tells its owner; each is called in the thread.
 
     ``sampled(sample, tick, periods)``: a sample of the run, so many periods after its first one;
     ``idle(sample)``: one outside of a run, or what stands where none could be read;
@@ -37,7 +50,8 @@ class Hooks(NamedTuple):
 
 
 class CardThread:
-    """Runs a monitor from its configuration to its end, which always closes the card.
+    """
+    Runs a monitor from its configuration to its end, which always closes the card.
 
     A run begins with tick 0, whose answer proves the loop closed. From then on the newest command
     is written once it answers the newest sample, or when ``patience`` s have passed since that
@@ -86,7 +100,8 @@ class CardThread:
         return not self._thread.is_alive()
 
     def ask(self, request: Callable[[Monitor], T], timeout: float = 5.0) -> T:
-        """Run ``request`` in the thread and return what it returns, or raise what it raises.
+        """
+        Run ``request`` in the thread and return what it returns, or raise what it raises.
 
         Raises TimeoutError when the card has kept the thread for ``timeout`` s.
         """

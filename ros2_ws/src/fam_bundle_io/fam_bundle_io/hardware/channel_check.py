@@ -1,16 +1,28 @@
-# SPDX-License-Identifier: Apache-2.0
-"""One valve at a time at low pressure: does its own transducer answer? Knows no terminal.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+One valve at a time at low pressure: does its own transducer answer? Knows no terminal.
 
 The source must have been turned down: no motor unit can then come above it, whichever transducer,
 wire or valve is wrong. A valve is opened along a slow ramp, so that it answers near its true
 middle, wherever that is, and goes back to the tank as soon as any transducer has answered.
 """
 
-import math
 from collections.abc import Callable
+import math
 from typing import NamedTuple
-
-import numpy as np
 
 from fam_bundle_io.hardware.backend import Setup
 from fam_bundle_io.hardware.calibration import (
@@ -24,6 +36,7 @@ from fam_bundle_io.hardware.limits import Limits
 from fam_bundle_io.hardware.monitor import Monitor, Sample
 from fam_bundle_io.hardware.safety import Refused, State
 from fam_bundle_model.hydraulics import TO_TANK
+import numpy as np
 
 LOWEST_SHARE = 0.5  # of the limit: a source below it is too low to tell an answer
 ANSWER_SHARE = 0.15  # of the limit: a rise by so much is an answer
@@ -53,7 +66,8 @@ class Finding(NamedTuple):
 
 
 class Pulse(NamedTuple):
-    """What a ramp of one valve did: changes from rest to its end.
+    """
+    What a ramp of one valve did: changes from rest to its end.
 
     ``rise`` (units,) in Pa, ``strain``, ``oil`` from the source in m^3, the last ``spool``.
     """
@@ -65,7 +79,8 @@ class Pulse(NamedTuple):
 
 
 class ChannelCheck:
-    """Checks a rig whose monitor is configured and inactive.
+    """
+    Checks a rig whose monitor is configured and inactive.
 
     ``limit`` is the highest pressure in Pa, of the source and of all units. ``tell`` gets a line
     some ten times a second. ``patience`` s are waited for the source to be set.
@@ -93,7 +108,8 @@ class ChannelCheck:
     # ---- Before ----
 
     def wait_for_rest(self) -> None:
-        """Wait until every unit is vented and the source is set, with the safe volts out.
+        """
+        Wait until every unit is vented and the source is set, with the safe volts out.
 
         A reversed sign shows here: such a unit fills at the safe volts. Raises CheckFailed for a
         unit that does not vent or that fills, and where the source is not set in time.
@@ -155,7 +171,8 @@ class ChannelCheck:
     # ---- One unit ----
 
     def check_unit(self, unit: int) -> Finding:
-        """Open the valve of ``unit`` until a transducer answers, vent, and say what answered.
+        """
+        Open the valve of ``unit`` until a transducer answers, vent, and say what answered.
 
         Raises CheckFailed where a fault or a unit that does not vent ends the check.
         """

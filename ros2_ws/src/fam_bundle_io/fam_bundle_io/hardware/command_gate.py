@@ -1,18 +1,31 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What becomes of a command on its way to the valves: refused, held, slowed, ramped to safe."""
 
 import math
 
-import numpy as np
-import numpy.typing as npt
-
 from fam_bundle_io.hardware.calibration import Calibration, Values
 from fam_bundle_io.hardware.limits import Limits
 from fam_bundle_model.hydraulics import TO_TANK
+import numpy as np
+import numpy.typing as npt
 
 
 class CommandGate:
-    """Holds the newest good command and how old it is.
+    """
+    Holds the newest good command and how old it is.
 
     ``applied`` (units,) is the spool that goes out; ``limited`` says that it is not the one that
     was asked for. Times are in ns of one steady clock.
@@ -46,7 +59,8 @@ class CommandGate:
         self._newest = self._good = None
 
     def take(self, spool: npt.NDArray[np.float64] | None, stamp: int, now: int) -> str:
-        """Take the command of ``stamp``, the moment it came; the same stamp again is no news.
+        """
+        Take the command of ``stamp``, the moment it came; the same stamp again is no news.
 
         Returns why commands can no longer be trusted, or nothing.
         """
@@ -77,7 +91,8 @@ class CommandGate:
         return self.age(now) <= self.limits.command_stale
 
     def apply(self, now: int, elapsed: float) -> str:
-        """Move ``applied`` towards the command, or towards safe where it is stale.
+        """
+        Move ``applied`` towards the command, or towards safe where it is stale.
 
         ``elapsed`` s have passed since the last move. Returns why the loop cannot go on, or
         nothing.

@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Every threshold of the bridge: what it tolerates, for how long, and how it goes safe."""
 
 from collections.abc import Mapping
@@ -86,7 +99,8 @@ class Limits:
 
 
 def make_limits(values: Mapping[str, Any]) -> Limits:
-    """Return the limits with ``values`` in place of their defaults.
+    """
+    Return the limits with ``values`` in place of their defaults.
 
     Raises ConfigurationError naming the parameter, its value and the bound.
     """

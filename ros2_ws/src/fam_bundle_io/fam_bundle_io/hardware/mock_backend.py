@@ -1,14 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
-"""A card that is none: every input mirrors an output. No physics, no clock.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A card that is none: every input mirrors an output. No physics, no clock.
 
 Input i reads ``rest_i + 0.01 (out_j - safe_j) + 0.001 (-1)^k`` V, where j is i modulo the number
 of outputs, ``rest_i`` what the sensor gives at zero, and k counts the reads: the last term keeps
 the inputs from looking dead. The watchdog expires, and a call fails, when told to.
 """
 
-import numpy as np
-
 from fam_bundle_io.hardware.backend import BackendError, Card, Volts
+import numpy as np
 
 SHARE, RIPPLE = 0.01, 0.001
 

@@ -1,16 +1,27 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Runs any card safely: one call per tick, and every way out puts the safe volts out.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Runs any card safely: one call per tick, and every way out puts the safe volts out.
 
 All calls but ``emergency_stop`` and ``now`` belong to the one thread that owns the card.
 """
 
+from collections.abc import Callable
 import dataclasses
 import time
-from collections.abc import Callable
 from types import TracebackType
-
-import numpy as np
-import numpy.typing as npt
 
 from fam_bundle_io.hardware.backend import Backend, Setup, Volts
 from fam_bundle_io.hardware.calibration import Calibration, Scaling, Values
@@ -19,11 +30,14 @@ from fam_bundle_io.hardware.limits import Limits
 from fam_bundle_io.hardware.safety import Refused, Safety, State
 from fam_bundle_io.hardware.sensor_watch import SensorWatch
 from fam_bundle_io.hardware.zeroing import Zeroing
+import numpy as np
+import numpy.typing as npt
 
 
 @dataclasses.dataclass(slots=True)
 class Sample:
-    """What a tick gave. One object, filled anew by every tick: copy what is to be kept.
+    """
+    What a tick gave. One object, filled anew by every tick: copy what is to be kept.
 
     ``values`` (4 + units,) are strain, force (N), source pressure (Pa), source flow (m^3/s) and
     the pressure of each motor unit (Pa), with the last good value where a channel does not
@@ -49,7 +63,8 @@ class Sample:
 
 
 class Monitor:
-    """Wraps a card: time-outs, limits, the watchdog, the state, and the way to safe.
+    """
+    Wraps a card: time-outs, limits, the watchdog, the state, and the way to safe.
 
     ``clock`` gives ns and never steps; None counts samples instead, for a loop in lock-step.
     """
@@ -111,7 +126,8 @@ class Monitor:
     # ---- Transitions ----
 
     def configure(self) -> None:
-        """Open the card; again after an expired watchdog, which this clears. A fault stays.
+        """
+        Open the card; again after an expired watchdog, which this clears. A fault stays.
 
         Raises Refused in another state, BackendError or ConfigurationError; the card is then
         closed.
@@ -132,7 +148,8 @@ class Monitor:
         self._report()
 
     def arm(self) -> None:
-        """Follow commands as soon as ``limits.activation_commands`` fresh ones have come.
+        """
+        Follow commands as soon as ``limits.activation_commands`` fresh ones have come.
 
         Raises Refused unless the bridge is inactive and every sensor measures.
         """
@@ -148,7 +165,8 @@ class Monitor:
             self._make_safe()
 
     def zero(self) -> None:
-        """Begin to zero; ``zeroing`` tells when it is done, ``calibration`` is then the new one.
+        """
+        Begin to zero; ``zeroing`` tells when it is done, ``calibration`` is then the new one.
 
         Raises Refused unless the bridge is inactive and every motor unit depressurised.
         """
@@ -177,7 +195,8 @@ class Monitor:
         self._stop = self._stop or reason
 
     def close(self) -> None:
-        """Put the safe volts out and let go of the card; a latched fault stays.
+        """
+        Put the safe volts out and let go of the card; a latched fault stays.
 
         Raises nothing but what ends the process; what went wrong is in ``fault``.
         """
@@ -219,7 +238,8 @@ class Monitor:
     # ---- The tick ----
 
     def tick(self, spool: npt.NDArray[np.float64] | None = None, stamp: int = 0) -> Sample:
-        """Put the newest command out, wait for the next sample, and return it.
+        """
+        Put the newest command out, wait for the next sample, and return it.
 
         ``spool`` (units,) is in -1 to 1, ``stamp`` the time by ``now()`` at which it came; give
         the same two again while there is no newer one. Whatever goes wrong is a latched fault

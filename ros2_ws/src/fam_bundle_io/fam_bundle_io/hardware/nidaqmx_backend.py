@@ -1,12 +1,26 @@
-# SPDX-License-Identifier: Apache-2.0
-"""A card of National Instruments through nidaqmx. It has not run on hardware.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+A card of National Instruments through nidaqmx. It has not run on hardware.
 
 Samples come by hardware-timed single point where the device has it, else one by one out of a
 continuous acquisition, the newest first. Outputs are written on demand.
 """
 
-import importlib
 from dataclasses import dataclass
+import importlib
 from typing import Any
 
 from fam_bundle_io.hardware.backend import BackendError, Card, Setup, Volts

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""When valves may move: states of the bridge, its fault latch, the limits of pressure. Pure.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+When valves may move: states of the bridge, its fault latch, the limits of pressure. Pure.
 
 ::
 
@@ -11,10 +25,9 @@
 
 import enum
 
-import numpy as np
-
-from fam_bundle_io.hardware.calibration import MU_PRESSURE, SOURCE_PRESSURE, Calibration, Values
+from fam_bundle_io.hardware.calibration import Calibration, MU_PRESSURE, SOURCE_PRESSURE, Values
 from fam_bundle_io.hardware.limits import Limits
+import numpy as np
 
 
 class State(enum.Enum):

@@ -1,20 +1,33 @@
-# SPDX-License-Identifier: Apache-2.0
-"""Tells measurements from what only looks like one: dead, frozen and jumping channels.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+Tells measurements from what only looks like one: dead, frozen and jumping channels.
 
 Pure, and without new arrays while all channels are well.
 """
 
-import numpy as np
-
 from fam_bundle_io.hardware.calibration import (
+    Calibration,
     FORCE,
     SOURCE_FLOW,
     STRAIN,
-    Calibration,
     Values,
     Volts,
 )
 from fam_bundle_io.hardware.limits import Limits
+import numpy as np
 
 # Without these the loop goes on, with the last good value.
 EXPENDABLE = (FORCE, SOURCE_FLOW)
@@ -23,7 +36,8 @@ STEADY = 2
 
 
 class SensorWatch:
-    """Holds the last good value of each channel, and says when one is lost.
+    """
+    Holds the last good value of each channel, and says when one is lost.
 
     A sample is no measurement while its volts are outside the live range, have not changed in
     the last bit for too long, or its value is farther from the last good one than the rig can
@@ -73,7 +87,8 @@ class SensorWatch:
         self.has_values = self.measuring = False
 
     def look(self, volts: Volts, values: Values, elapsed: float) -> str:
-        """Put the last good value in place of each in ``values`` (channels,) that is none.
+        """
+        Put the last good value in place of each in ``values`` (channels,) that is none.
 
         ``volts`` (channels,) are what they come from; ``elapsed`` s have passed since the last
         look. Returns why the loop cannot go on, or nothing.

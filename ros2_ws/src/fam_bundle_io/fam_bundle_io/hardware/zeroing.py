@@ -1,25 +1,38 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Zero strain and pressures while every motor unit is vented: a mean, or a refusal. Pure."""
 
 import math
 
-import numpy as np
-
 from fam_bundle_io.hardware.calibration import (
+    Calibration,
     MU_PRESSURE,
+    SensorCalibration,
     SOURCE_PRESSURE,
     STRAIN,
-    Calibration,
-    SensorCalibration,
     Values,
     Volts,
     zeroed,
 )
 from fam_bundle_io.hardware.limits import Limits
+import numpy as np
 
 
 class Zeroing:
-    """Takes samples until it has enough; then there is a ``result`` or a ``refusal``.
+    """
+    Takes samples until it has enough; then there is a ``result`` or a ``refusal``.
 
     The source's pressure is zeroed too if the source is off, that is below
     ``limits.depressurised``.

@@ -1,10 +1,23 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Every backend on a bench: what is at its terminals, time that passes, calls that fail."""
 
 import contextlib
 import dataclasses
-import sys
 from pathlib import Path
+import sys
 
 import numpy as np
 import pytest
@@ -13,7 +26,6 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import fake_nidaqmx
 import fake_quanser
-
 from fam_bundle_io.hardware import backend
 from fam_bundle_io.hardware.backend import load_backend, make_setup
 from fam_bundle_io.hardware.calibration import load_hardware

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The package ``nidaqmx`` without hardware, stricter than the vendor's: see fake_quanser.py.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The package ``nidaqmx`` without hardware, stricter than the vendor's: see fake_quanser.py.
 
 Names, codes and what a call raises are those of nidaqmx 1.x.
 """

@@ -1,5 +1,19 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The vendor's module ``quanser.hardware`` without hardware, stricter than the vendor's.
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""
+The vendor's module ``quanser.hardware`` without hardware, stricter than the vendor's.
 
 It refuses what the vendor's takes and reads as garbage: wrong types, arrays with gaps, calls out
 of order. Its card has volts at its terminals, a clock that ``read`` or ``advance`` moves, and a

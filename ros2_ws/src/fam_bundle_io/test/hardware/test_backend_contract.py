@@ -1,9 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What every card must do, whoever made it: the same sentences for each backend."""
 
+from conftest import PERIOD, SAFE_VOLTS
 import numpy as np
 import pytest
-from conftest import PERIOD, SAFE_VOLTS
 
 SAFE = list(SAFE_VOLTS)
 OPEN = [4.0, -3.5]  # volts of valves that are partly open

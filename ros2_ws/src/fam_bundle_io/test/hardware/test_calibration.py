@@ -1,27 +1,39 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Volts become SI values and spools become volts, both ways, to rounding and with the sign."""
 
 import dataclasses
 import re
 
-import numpy as np
-import pytest
-import yaml
 from conftest import CONFIG
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
-
 from fam_bundle_io.hardware.calibration import (
-    MU_PRESSURE,
-    STRAIN,
-    Scaling,
     load_hardware,
     make_calibration,
+    MU_PRESSURE,
+    Scaling,
+    STRAIN,
     write_hardware,
     zeroed,
 )
 from fam_bundle_io.hardware.limits import Limits, make_limits
 from fam_bundle_model.schema import ConfigurationError, declarations
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+import yaml
 
 SHIPPED = CONFIG / 'volts_calibration.yaml'
 TEMPLATE = CONFIG / 'hardware_calibration_template.yaml'
@@ -108,7 +120,8 @@ VOLTS = st.floats(-10.0, 10.0)
 @settings(deadline=None, max_examples=400)
 @given(GAINS, VOLTS, VOLTS)
 def test_volts_to_value_and_back_is_exact_to_rounding(gain, offset, volts):
-    """Three roundings act on the difference to the offset, one on the result.
+    """
+    Three roundings act on the difference to the offset, one on the result.
 
     Each is at most u = 2^-53 of what it rounds: |error| <= 3 u |v - o| + u |v|; twice that leaves
     room for the products of roundings. Below 1e-290 a double has fewer digits.

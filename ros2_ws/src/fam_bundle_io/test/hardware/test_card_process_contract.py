@@ -1,21 +1,33 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The contract of every card, kept by one that is a process of its own and has its own time."""
 
 import dataclasses
+from pathlib import Path
 import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 
-import numpy as np
-import pytest
-from conftest import PERIOD, Bench
-from test_backend_contract import *  # noqa: F403  the same sentences
-from test_backend_contract import OPEN
-
+from conftest import Bench, PERIOD
 from fam_bundle_io.hardware.backend import load_backend
 from fam_bundle_sim.volts_card import read_log
+import numpy as np
+import pytest
+from test_backend_contract import *  # noqa: F403  the same sentences
+from test_backend_contract import OPEN
 
 SLEEP = time.sleep  # the benches of other cards replace it
 WATCHDOG = 0.4  # s: the tests share a machine with others

@@ -1,19 +1,31 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The thread of the card runs a loop, serves others, and always ends with the safe volts out."""
 
+from pathlib import Path
 import threading
 import time
 import tracemalloc
-from pathlib import Path
-
-import numpy as np
-import pytest
 
 from fam_bundle_io.hardware import card_thread
 from fam_bundle_io.hardware.backend import load_backend, make_setup
 from fam_bundle_io.hardware.card_thread import CardThread, Hooks
 from fam_bundle_io.hardware.monitor import Monitor
 from fam_bundle_io.hardware.safety import Refused, State
+import numpy as np
+import pytest
 
 PERIOD = 0.001
 PATIENCE = 0.5  # s; long enough for every answer that is to come

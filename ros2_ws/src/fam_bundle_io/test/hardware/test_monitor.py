@@ -1,22 +1,34 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The monitor around every card: it goes safe whatever happens, and says why."""
 
 import dataclasses
 import gc
 import math
+from pathlib import Path
 import re
 import tracemalloc
-from pathlib import Path
 
-import numpy as np
-import pytest
 from conftest import NOMINAL, PERIOD, SAFE_VOLTS
-
 import fam_bundle_io.hardware
 from fam_bundle_io.hardware import backend as backend_module
 from fam_bundle_io.hardware.limits import Limits
 from fam_bundle_io.hardware.monitor import Monitor
 from fam_bundle_io.hardware.safety import Refused, State
+import numpy as np
+import pytest
 
 SAFE = list(SAFE_VOLTS)
 LIMITS = Limits(activation_commands=3, frozen_samples=0)

@@ -1,16 +1,23 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """No sequence of calls, commands, time and faults leaves a valve powered while not active."""
 
 import math
 
-import fake_quanser
-import numpy as np
-import pytest
 from conftest import CONFIG, NOMINAL, PERIOD, RESTING_VOLTS, SAFE_VOLTS
-from hypothesis import HealthCheck, settings
-from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
-
+import fake_quanser
 from fam_bundle_io.hardware import backend as backend_module
 from fam_bundle_io.hardware.backend import make_setup
 from fam_bundle_io.hardware.calibration import load_hardware
@@ -18,6 +25,11 @@ from fam_bundle_io.hardware.limits import Limits
 from fam_bundle_io.hardware.monitor import Monitor
 from fam_bundle_io.hardware.quanser_backend import QuanserBackend
 from fam_bundle_io.hardware.safety import Refused, State
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import initialize, invariant, precondition, rule, RuleBasedStateMachine
+import numpy as np
+import pytest
 
 SAFE = {0: -9.375, 1: -9.375}  # the shipped valves: full spool to the tank
 BREAKABLE = (

@@ -1,4 +1,17 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """When valves may move, what is a measurement, what becomes of a command; each law alone."""
 
 import dataclasses
@@ -6,18 +19,17 @@ import itertools
 import math
 import re
 
-import numpy as np
-import pytest
 from conftest import NOMINAL, PERIOD
-from hypothesis import given, settings
-from hypothesis import strategies as st
-
-from fam_bundle_io.hardware.calibration import MU_PRESSURE, SOURCE_PRESSURE, STRAIN, Scaling
+from fam_bundle_io.hardware.calibration import MU_PRESSURE, Scaling, SOURCE_PRESSURE, STRAIN
 from fam_bundle_io.hardware.command_gate import CommandGate
 from fam_bundle_io.hardware.limits import Limits
 from fam_bundle_io.hardware.safety import Refused, Safety, State
 from fam_bundle_io.hardware.sensor_watch import SensorWatch
 from fam_bundle_io.hardware.zeroing import Zeroing
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
 
 LIMITS = Limits()
 MS = 1_000_000  # ns
@@ -496,7 +508,6 @@ def test_no_spool_moves_faster_than_its_limit_and_what_is_limited_says_so(spools
 
 def shipped():
     from conftest import CONFIG
-
     from fam_bundle_io.hardware.calibration import load_hardware
 
     return load_hardware(CONFIG / 'volts_calibration.yaml')

@@ -1,19 +1,31 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """What is each vendor's own: the order of its calls, its codes, its absence."""
 
 import dataclasses
 import sys
 import types
 
+from conftest import NidaqmxBench, QuanserBench, RESTING_VOLTS
 import fake_nidaqmx
 import fake_quanser
+from fam_bundle_io.hardware import backend as module
+from fam_bundle_io.hardware.backend import backend_names, BackendError, load_backend
+from fam_bundle_model.schema import ConfigurationError
 import numpy as np
 import pytest
-from conftest import RESTING_VOLTS, NidaqmxBench, QuanserBench
-
-from fam_bundle_io.hardware import backend as module
-from fam_bundle_io.hardware.backend import BackendError, backend_names, load_backend
-from fam_bundle_model.schema import ConfigurationError
 
 
 @pytest.fixture

@@ -1,12 +1,22 @@
-# SPDX-License-Identifier: Apache-2.0
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """The paper's controllers through volts: the same Table 2 as without."""
 
 import dataclasses
 
-import numpy as np
-import pytest
 from conftest import CONFIG
-
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_control.pressure_loop import pressure_loop, pressure_loop_step
 from fam_bundle_control.recruitment import recruitment, recruitment_start, recruitment_step
@@ -21,6 +31,8 @@ from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.lag_table import cached_lag_table
 from fam_bundle_model.parameters import load_configuration, seconds
 from fam_bundle_model.reference import reference_law, strain_reference
+import numpy as np
+import pytest
 
 
 def paper(scheme, **changes):
