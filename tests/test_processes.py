@@ -91,7 +91,9 @@ def test_plant_that_is_told_to_stop_has_not_finished(
 
 
 @pytest.mark.parametrize('sent', [signal.SIGINT, signal.SIGTERM])
-def test_signal_ends_every_process(sent: int, long_run: 'subprocess.Popen[str]') -> None:
+def test_signal_ends_every_process(
+    sent: int, long_run: 'subprocess.Popen[str]', tmp_path: Path
+) -> None:
     nodes = children(long_run.pid)
     long_run.send_signal(sent)
     _, stderr = long_run.communicate(timeout=PATIENCE)
@@ -99,6 +101,46 @@ def test_signal_ends_every_process(sent: int, long_run: 'subprocess.Popen[str]')
     assert 'interrupted' in stderr
     assert 'Traceback' not in stderr
     assert_gone(nodes)
+    for log in (tmp_path / 'log').iterdir():
+        assert 'FATAL' not in log.read_text()
+        assert 'Error' not in log.read_text()
+
+
+def test_controllers_that_are_told_to_stop_end_well(
+    long_run: 'subprocess.Popen[str]', tmp_path: Path
+) -> None:
+    nodes = children(long_run.pid)
+    for name in ('strain_controller', 'lag_table_server'):
+        os.kill(nodes[name], signal.SIGINT)
+    _, stderr = long_run.communicate(timeout=PATIENCE)
+    assert long_run.returncode == 1  # the run is not finished
+    assert 'ended with exit status 0' in stderr
+
+
+def test_second_interrupt_does_not_cut_the_first_ones_work_short(tmp_path: Path) -> None:
+    script = """
+import os, signal, sys, threading, time
+from pathlib import Path
+from fam_bundle_bringup.processes import NodeGroup
+
+patient = 'import signal, time; signal.signal(signal.SIGINT, lambda *_: (time.sleep(0.5), ' \
+    'print("done", flush=True), exit())); print("ready", flush=True); time.sleep(60)'
+with NodeGroup(os.environ, Path(sys.argv[1])) as group:
+    group.start('patient', [sys.executable, '-c', patient])
+    while not (Path(sys.argv[1]) / 'patient.log').read_text():
+        time.sleep(0.01)
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+"""
+    done = subprocess.run(
+        [sys.executable, '-c', script, str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert (tmp_path / 'patient.log').read_text() == 'ready\ndone\n'
+    assert done.returncode == -signal.SIGINT  # and then it counts
+    assert 'KeyboardInterrupt' in done.stderr
 
 
 def test_killed_runner_leaves_no_node_behind(long_run: 'subprocess.Popen[str]') -> None:

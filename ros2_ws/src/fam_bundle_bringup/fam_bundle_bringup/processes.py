@@ -14,13 +14,14 @@
 
 """The nodes of a run as processes: started together, watched, and always ended."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 import contextlib
 import ctypes
 import os
 from pathlib import Path
 import signal
 import subprocess
+import threading
 import time
 from typing import NamedTuple
 
@@ -100,7 +101,11 @@ class NodeGroup:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End every node: first asked, then killed."""
+        """End every node: first asked, then killed; another Ctrl-C waits until that is done."""
+        with signals_held():
+            self._end()
+
+    def _end(self) -> None:
         for node in self._nodes:
             with contextlib.suppress(ProcessLookupError):
                 node.process.send_signal(signal.SIGCONT)  # one that was stopped hears nothing
@@ -112,6 +117,26 @@ class NodeGroup:
             except subprocess.TimeoutExpired:
                 node.process.kill()
                 node.process.wait()
+
+
+@contextlib.contextmanager
+def signals_held() -> Iterator[None]:
+    """Let SIGINT and SIGTERM wait until the end of the context, where Python handles signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, _: came.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in came[:1]:
+            signal.raise_signal(number)
 
 
 def _ending(status: int) -> str:

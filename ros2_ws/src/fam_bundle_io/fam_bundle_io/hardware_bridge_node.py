@@ -70,6 +70,8 @@ CONFIGURE_TIMEOUT = 60.0  # s; a simulated rig compiles its laws, a card may loa
 class HardwareBridge(LoopNode, LifecycleNodeMixin):
     """Publishes what the sensors measure and puts commands out, as far as the monitor lets it."""
 
+    OWNS_RUN = True
+
     def __init__(self) -> None:
         """Find backend and hardware file; raises ConfigurationError where they cannot be used."""
         super().__init__('hardware_bridge', GROUPS)

@@ -60,6 +60,8 @@ class LoopNode(Node):
     counted and dropped, and three close together are a trouble until they have ceased.
     """
 
+    OWNS_RUN = False  # whether a run begins and ends with this node
+
     def __init__(self, name: str, groups: Iterable[str]) -> None:
         """Declare the parameters of ``groups``; raises ConfigurationError when one is bad."""
         super().__init__(name)

@@ -15,8 +15,10 @@
 """Runs nodes of the loop in this process until they are done: executor, tuning, exit status."""
 
 from collections.abc import Callable, Sequence
+import signal
 import sys
 import time
+from types import FrameType
 
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.loop_node import LoopNode
@@ -28,6 +30,7 @@ from rclpy.task import Future
 
 INTERRUPTED = 130
 SIGNAL_TIME = 0.2  # s between a callback that a signal cuts short and the end of the context
+RCLError = rclpy_implementation.RCLError
 CUT_SHORT = 'Unable to convert call argument'  # of the events executor
 
 
@@ -53,15 +56,14 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
     """
     Run nodes on one executor until the first is done or told to stop; return its exit status.
 
-    0 when it has done its work, 1 after a failure, 2 for a bad configuration, 130 when it was told
-    to stop before.
+    0 when it has done its work, 1 after a failure, 2 for a bad configuration. When it was told to
+    stop before, 130 if one of them owns the run, which then is not finished; else 0, for a
+    controller runs until it is told.
     """
+    ends = Interrupts()
     try:
         rclpy.init()
         nodes = [make_node() for make_node in makers]
-    except rclpy_implementation.RCLError as error:  # a parameter file that is missing or no YAML
-        print(' '.join(str(error).split()), file=sys.stderr)
-        return 2
     except ConfigurationError as error:
         print(f'{error} (parameters: --ros-args --params-file FILE)', file=sys.stderr)
         rclpy.try_shutdown()
@@ -69,7 +71,13 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
     except (KeyboardInterrupt, ExternalShutdownException):
         rclpy.try_shutdown()
         return INTERRUPTED
+    except RCLError as error:
+        if rclpy.get_default_context().is_valid() or not ends.told:
+            print(' '.join(str(error).split()), file=sys.stderr)  # a file missing or no YAML
+            return 2
+        return INTERRUPTED
     done = first_done(nodes)
+    ends.raised = False  # in a callback, the executor would make a fatal error of it
     try:
         spin(nodes, done)
         if done.done() and done.result() == 0:
@@ -79,15 +87,35 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
         pass
     except RuntimeError as error:
         # A callback was under way when a signal ended the context: rcl and the executor say so.
-        known = isinstance(error, rclpy_implementation.RCLError) or CUT_SHORT in str(error)
+        known = isinstance(error, RCLError) or CUT_SHORT in str(error)
         if not known or not context_ends():
             raise
     finally:
         for node in nodes:
             node.close()
-    status: int = done.result() if done.done() else INTERRUPTED
+    stopped = INTERRUPTED if any(node.OWNS_RUN for node in nodes) else 0
+    status: int = done.result() if done.done() else stopped
     rclpy.try_shutdown()
     return status
+
+
+class Interrupts:
+    """
+    Ctrl-C as an exception while nodes are made, and as the end of the context afterwards.
+
+    Made before rclpy is set up, whose own signal handlers end the context and then call these.
+    """
+
+    def __init__(self) -> None:
+        """Take SIGINT and SIGTERM."""
+        self.raised, self.told = True, False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.told = True
+        if self.raised:
+            raise KeyboardInterrupt
 
 
 def context_ends() -> bool:

@@ -19,6 +19,8 @@ import threading
 
 from rclpy.node import Node
 
+ENOUGH = 1.0  # s for waking an executor
+
 
 class SteadyTimer:
     """
@@ -43,7 +45,8 @@ class SteadyTimer:
         self._node, self._period = node, period
         self._callback, self._failed = callback, failed
         self._ended = threading.Event()
-        threading.Thread(target=self._run, name='timer', daemon=True).start()
+        self._thread = threading.Thread(target=self._run, name='timer', daemon=True)
+        self._thread.start()
 
     def _run(self) -> None:
         while not self._ended.wait(self._period):
@@ -61,5 +64,7 @@ class SteadyTimer:
             self._failed(error)
 
     def cancel(self) -> None:
-        """Call no more."""
+        """Call no more; nothing of it runs on, in rclpy least of all, while Python ends."""
         self._ended.set()
+        if threading.current_thread() is not self._thread:
+            self._thread.join(ENOUGH)

@@ -65,6 +65,8 @@ class PlantSimulator(LoopNode):
     pacing. The node ends by itself after the run's last tick.
     """
 
+    OWNS_RUN = True
+
     def __init__(self) -> None:
         """Rest until the loop is complete."""
         super().__init__('plant_simulator', GROUPS)
