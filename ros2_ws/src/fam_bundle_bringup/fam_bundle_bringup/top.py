@@ -23,6 +23,7 @@ import time
 from typing import NamedTuple
 
 from fam_bundle_bringup.domain_marker import chosen_domain
+from fam_bundle_bringup.processes import signals_held
 from fam_bundle_bringup.statistics_listener import listening, Report
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.live import Live
@@ -231,27 +232,30 @@ def run_top(asked: int | None, seconds: float) -> None:
             print('fam top: no experiment is running, so this is domain 0', file=sys.stderr)
             domain = 0
         console = Console()
-        with listening(domain) as listen:
+        # An exception in one of its callbacks would be an error of the executor's.
+        with listening(domain) as listen, signals_held() as told:
             end = time.monotonic() + seconds
             if sys.stdout.isatty() and not console.is_dumb_terminal:
-                show_live(console, listen, domain, end)
+                show_live(console, listen, domain, end, told)
             else:
-                print_lines(listen, end)
+                print_lines(listen, end, told)
 
 
-def show_live(console: Console, listen: Listen, domain: int, end: float) -> None:
-    """Show the last report of each node until the steady time ``end``."""
+def show_live(
+    console: Console, listen: Listen, domain: int, end: float, told: Sequence[int] = ()
+) -> None:
+    """Show the last report of each node until the steady time ``end`` or ``told`` to end."""
     last: dict[str, Report] = {}
     with Live(console=console, screen=True, auto_refresh=False) as live:
-        while (now := time.monotonic()) < end:
+        while not told and (now := time.monotonic()) < end:
             live.update(view(last.values(), now, domain, console.height), refresh=True)
             last.update((report.node, report) for report in listen(min(REDRAW, end - now)))
 
 
-def print_lines(listen: Listen, end: float) -> None:
-    """Print one line per report until the steady time ``end`` or until nobody reads on."""
+def print_lines(listen: Listen, end: float, told: Sequence[int] = ()) -> None:
+    """Print a line per report until the steady time ``end``, ``told`` to end, or not read on."""
     try:
-        while (now := time.monotonic()) < end:
+        while not told and (now := time.monotonic()) < end:
             for report in listen(min(SLICE, end - now)):
                 print(plain_line(report), flush=True)
     except BrokenPipeError:
