@@ -26,6 +26,8 @@ from fam_bundle_model.parameters import Configuration, write_yaml
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.alone
+
 Make = Callable[..., Configuration]
 SHORT = {'amplitude': 0.06, 'frequency': 0.5, 'cycles': 1}
 

@@ -22,6 +22,8 @@ from fam_bundle_io.hardware.calibration import MU_PRESSURE
 from fam_bundle_model.parameters import load_configuration
 import pytest
 
+pytestmark = pytest.mark.alone
+
 BAD_SAMPLES = 4  # limits.sensor_samples
 
 

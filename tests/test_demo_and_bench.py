@@ -18,6 +18,8 @@ from fam_bundle_model.schema import ConfigurationError
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.alone
+
 FIGURES = {
     'figure_06_response',
     'figure_07_prediction',

@@ -12,6 +12,8 @@ from fam_bundle_bringup.graph import NODES
 from fam_bundle_io.trace import load_trace
 import pytest
 
+pytestmark = pytest.mark.alone
+
 PATIENCE = 60.0  # s; only a hang takes that long
 
 

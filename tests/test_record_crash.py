@@ -23,6 +23,8 @@ from mcap.reader import make_reader
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.alone
+
 LOOP = ('bundle_state', 'pressure_reference', 'recruitment_state', 'valve_command')
 PATIENCE = 60.0  # s; only a hang takes that long
 COST = 2.0  # s of messages that a crash may cost; half a second where the machine keeps up

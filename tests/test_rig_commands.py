@@ -25,6 +25,8 @@ import numpy as np
 import pytest
 import yaml
 
+pytestmark = pytest.mark.alone
+
 ROOT = Path(__file__).resolve().parents[1]
 VOLTS = default_configuration().with_name('volts_calibration.yaml')
 TEMPLATE = default_configuration().with_name('hardware_calibration_template.yaml')

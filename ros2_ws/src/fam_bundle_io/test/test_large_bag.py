@@ -37,6 +37,8 @@ print(len(run.ticks), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
 RECOVER = """
 import pathlib, resource, sys
 from fam_bundle_io.recover import recover_bag
+
+pytestmark = pytest.mark.alone
 bag = pathlib.Path(sys.argv[1])
 recovery = recover_bag(bag, bag.with_name('out'))
 count = recovery.topics['/bundle_state']['count']

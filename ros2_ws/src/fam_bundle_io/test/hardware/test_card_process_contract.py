@@ -29,6 +29,8 @@ import pytest
 from test_backend_contract import *  # noqa: F403  the same sentences
 from test_backend_contract import OPEN
 
+pytestmark = pytest.mark.alone
+
 SLEEP = time.sleep  # the benches of other cards replace it
 WATCHDOG = 0.4  # s: the tests share a machine with others
 

@@ -27,6 +27,8 @@ from fam_bundle_io.hardware.safety import Refused, State
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.alone
+
 PERIOD = 0.001
 PATIENCE = 0.5  # s; long enough for every answer that is to come
 
