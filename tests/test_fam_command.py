@@ -420,6 +420,18 @@ def test_the_lock_of_npm_pins_with_hashes_and_holds_no_address():
         assert re.fullmatch(r'[\d.]+', package['version'])
 
 
+# What pytest says of the tests that bear company and of those that need the machine alone.
+@pytest.mark.parametrize(
+    ('beside', 'alone', 'status'),
+    [(0, 0, 0), (5, 0, 0), (0, 5, 0), (5, 5, 1), (1, 0, 1), (0, 1, 1), (5, 1, 1), (2, 5, 1)],
+)
+def test_tests_fail_if_either_part_fails_or_none_was_chosen(tree, beside, alone, status):
+    tree.pretend_set_up()
+    script = f'case "$*" in *"not alone"*) exit {beside};; *pytest*) exit {alone};; esac'
+    executable(tree.root / '.venv/bin/python', script)
+    assert tree.fam('test', '-k', 'lag')[0] == status
+
+
 def test_fam_is_executable():
     assert os.stat(REPOSITORY / 'fam').st_mode & stat.S_IXUSR
 
