@@ -40,7 +40,7 @@ Messages = dict[str, list[Message]]  # by topic
 
 @pytest.fixture
 def bag(recorded_runs: Path) -> Path:
-    """The bag of a run through the graph."""
+    """Return the bag of a run through the graph."""
     return recorded_runs / 'lag_pressure' / 'bag'
 
 
@@ -81,7 +81,7 @@ def message_values(message: Any, name: str, types: Any) -> Values:
 
 
 def types_in(bag: Path) -> Any:
-    """The types of Jazzy, and those that the bag defines."""
+    """Return the types of Jazzy, and those that the bag defines."""
     store = get_typestore(Stores.ROS2_JAZZY)
     with Reader(bag) as reader:
         for connection in reader.connections:

@@ -29,7 +29,7 @@ def settled(fam: dict[str, Any] | None = None, **reference: Any) -> Found:
 
 @pytest.fixture(scope='module', params=[0.03, 0.06])
 def found(request: pytest.FixtureRequest) -> Found:
-    """A small reference, which one unit holds alone, and the paper's, which needs both."""
+    """Settle a small reference, which one unit holds alone, and the paper's."""
     return settled(amplitude=request.param)
 
 

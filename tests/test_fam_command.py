@@ -111,7 +111,7 @@ class Tree:
             step.stamp.write_text(step.digest)
 
     def build_is_due(self, colcon):
-        """A finished set-up, after which a message changed; colcon is this script."""
+        """Pretend a finished set-up, after which a message changed; colcon is this script."""
         self.pretend_set_up()
         build = self.root / 'ros2_ws/build'
         build.mkdir()

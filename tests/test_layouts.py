@@ -123,7 +123,7 @@ def is_number(signal: Signal) -> bool:
 
 @pytest.fixture(scope='module')
 def bag(recorded_runs: Path) -> Bag:
-    """What a run through the graph recorded."""
+    """Return what a run through the graph recorded."""
     return read_bag(recorded_runs / 'lag_pressure' / 'bag')
 
 
@@ -207,7 +207,7 @@ def children(element: ElementTree.Element, *names: str) -> list[ElementTree.Elem
 
 
 def areas(splitter: ElementTree.Element) -> Iterator[ElementTree.Element]:
-    """The plots below a splitter, which must say how it divides its place."""
+    """Return the plots below a splitter, which must say how it divides its place."""
     parts = children(splitter, 'DockSplitter', 'DockArea')
     sizes = [float(size) for size in splitter.attrib['sizes'].split(';')]
     assert splitter.attrib['orientation'] in '|-'

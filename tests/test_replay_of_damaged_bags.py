@@ -38,7 +38,7 @@ def same_units() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def loud() -> Iterator[None]:
-    """A warning would print source line and path."""
+    """Make warnings errors: one would print source line and path."""
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         yield

@@ -307,7 +307,7 @@ class BridgeRig(Rig):
     def log(self, since: int = 0) -> Log:
         """Return what the card has logged since then (ns, steady)."""
         rows = read_log(self.card_log, len(self.safe_volts))
-        return rows[np.searchsorted(rows['time'], since) :]
+        return rows[np.searchsorted(rows['time'], since) :]  # noqa: E203
 
     def first(self, event: str, since: int) -> int | None:
         """Return when the first ``event`` since then was (ns); its details may follow."""

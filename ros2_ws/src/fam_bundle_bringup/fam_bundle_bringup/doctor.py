@@ -64,7 +64,7 @@ class Result(NamedTuple):
 
 
 def check_python() -> Result:
-    """Is this Python one of those that we test with?"""
+    """Check that this Python is one of those that we test with."""
     version = sys.version_info[:2]
     if OLDEST_PYTHON <= version <= NEWEST_PYTHON:
         return Result(OK, f'{platform.python_version()} at {sys.executable}')
@@ -104,7 +104,7 @@ def words(error: BaseException) -> str:
 
 
 def check_kernel() -> Result:
-    """Does the kernel keep promises of time?"""
+    """Check whether the kernel keeps promises of time."""
     found = f'{platform.system()} {platform.release()}'
     if REALTIME_KERNEL.exists() or 'PREEMPT_RT' in platform.version():
         return Result(OK, f'{found}, PREEMPT_RT')
@@ -112,7 +112,7 @@ def check_kernel() -> Result:
 
 
 def check_clock(path: Path = CLOCK) -> Result:
-    """Is the steady clock quick to read?"""
+    """Check that the steady clock is quick to read."""
     try:
         name = path.read_text().strip()
     except OSError as error:
@@ -123,7 +123,7 @@ def check_clock(path: Path = CLOCK) -> Result:
 
 
 def check_cores(mask: int) -> Result:
-    """Are there cores enough for five nodes, and those that ``process.cpu_mask`` names?"""
+    """Check for cores enough for five nodes, and those that ``process.cpu_mask`` names."""
     cores = os.sched_getaffinity(0)
     absent = {cpu for cpu in range(mask.bit_length()) if mask >> cpu & 1} - cores
     if absent:
@@ -136,7 +136,7 @@ def check_cores(mask: int) -> Result:
 
 
 def check_disk(period: float, folder: Path) -> Result:
-    """Is there room for a bag of ten minutes?"""
+    """Check for room for a bag of ten minutes."""
     free = shutil.disk_usage(folder).free
     minutes = free / (BYTES_PER_TICK / period * 60.0)
     found = f'{free / 1e9:.1f} GB free at {folder.resolve()}: bags of {minutes:.0f} minutes'
@@ -165,7 +165,7 @@ def refusal(action: Callable[[], Any]) -> str:
 
 
 def check_priority(asked: int) -> Result:
-    """Would SCHED_FIFO be granted?"""
+    """Check whether SCHED_FIFO would be granted."""
     wanted = asked or USUAL_PRIORITY
     parameter = os.sched_param(wanted)
     refused = refusal(lambda: os.sched_setscheduler(0, os.SCHED_FIFO, parameter))
@@ -178,7 +178,7 @@ def check_priority(asked: int) -> Result:
 
 
 def check_memory_lock(*, asked: bool) -> Result:
-    """Could all memory be locked?"""
+    """Check whether all memory could be locked."""
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     asks = f'process.lock_memory = {str(asked).lower()}' + ('' if asked else ': not asked for')
     if limit == resource.RLIM_INFINITY or _has_capability(IPC_LOCK):
@@ -195,7 +195,7 @@ def _has_capability(bit: int) -> bool:
 
 
 def check_timer_slack(asked: float) -> Result:
-    """Would the kernel wake sleepers as punctually as the configuration asks?"""
+    """Check that the kernel would wake sleepers as punctually as the configuration asks."""
     from fam_bundle_node.tuning import set_timer_slack
 
     if asked == 0.0:
@@ -211,7 +211,7 @@ def check_timer_slack(asked: float) -> Result:
 
 
 def check_ros() -> Result:
-    """Can nodes be made, and our messages be sent?"""
+    """Check that nodes can be made and our messages be sent."""
     needed = ('rclpy', 'std_srvs.srv', 'fam_bundle_msgs.msg', 'fam_bundle_msgs.srv', *PACKAGES)
     broken = [trouble for name in needed if (trouble := import_trouble(name))]
     if broken:
@@ -224,7 +224,7 @@ def check_ros() -> Result:
 
 
 def check_middleware() -> Result:
-    """Do nodes that are started from here stay on this machine?"""
+    """Check that nodes that are started from here stay on this machine."""
     from ament_index_python.packages import get_package_share_directory
 
     share = Path(get_package_share_directory('fam_bundle_bringup'))
@@ -263,7 +263,7 @@ def check_backend(name: str) -> Result:
 
 
 def check_hardware(path: Path | None, backend: str) -> Result:
-    """Is the hardware file whole, and made for this rig?"""
+    """Check that the hardware file is whole and made for this rig."""
     from fam_bundle_bringup.bridge_options import SIMULATED
     from fam_bundle_io.hardware.calibration import load_hardware
     from fam_bundle_model.schema import ConfigurationError
@@ -329,7 +329,7 @@ def _blanks(name: str, content: Any) -> Iterator[str]:
 
 
 def check_configuration(path: Path | None, hardware: Path | None, backend: str) -> Result:
-    """Is the parameter file valid, and of as many motor units as the hardware file?"""
+    """Check that the parameter file is valid and of as many motor units as the hardware file."""
     from fam_bundle_bringup.bridge_options import SIMULATED
     from fam_bundle_bringup.experiment import checked_configuration, default_configuration
     from fam_bundle_io.hardware.calibration import load_hardware

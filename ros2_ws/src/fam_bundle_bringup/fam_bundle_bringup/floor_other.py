@@ -232,7 +232,7 @@ def idl_type(kind: str) -> Any:
     from cyclonedds.idl import make_idl_struct, types
 
     if kind.startswith('sequence<'):
-        return types.sequence[idl_type(kind[len('sequence<') : -1])]
+        return types.sequence[idl_type(kind[len('sequence<') : -1])]  # noqa: E203
     if '/' in kind:
         package, name = kind.split('/')
         message_type = getattr(importlib.import_module(f'{package}.msg'), name)

@@ -224,7 +224,7 @@ def measured_state(rig: Plant, samples: Samples, row: int, spool: Array) -> Arra
     for i, unit in enumerate(rig.units):
         pressure = float(samples.mu_pressure[row, i])
         state[UNITS + i] = fam.oil_of(unit.fam, pressure, strain, rig.hydraulics.bulk_modulus)
-    state[UNITS + units :] = spool
+    state[UNITS + units :] = spool  # noqa: E203
     return state
 
 
@@ -265,7 +265,8 @@ def _simulate(
     anew = set(marks)
     for k, row in enumerate(course.row):
         if row in anew:
-            state[:] = measured_state(rig, samples, row, state[UNITS + units :].copy())
+            spool = state[UNITS + units :].copy()  # noqa: E203
+            state[:] = measured_state(rig, samples, row, spool)
         if row >= 0:
             seen = read(instruments, look(rig, state, pressure), quiet, pressure)
             rows[row, :3] = seen.strain, seen.force, seen.source_pressure

@@ -288,7 +288,7 @@ def _range(name: Any, content: Any) -> Range:
 
 
 def _check_set_once(study: Study) -> None:
-    """Raise ConfigurationError where two entries set one parameter: which would hold?"""
+    """Raise ConfigurationError where two entries set one parameter."""
     owners = dict.fromkeys(study.changes, 'changes')
     for entry, names in (
         *((f'grid: {axis.name}', _set_by(axis)) for axis in study.grid),

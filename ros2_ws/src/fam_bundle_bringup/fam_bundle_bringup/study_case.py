@@ -52,7 +52,7 @@ class Setting(NamedTuple):
         """Return the configuration of the rig that is there."""
         return self.believed if self.actual is None else self.actual
 
-    def hash(self) -> str:
+    def hash(self) -> str:  # noqa: A003
         """Return a hash of all that shapes a result."""
         return ' '.join(c.hash() for c in self if c is not None)
 

@@ -261,7 +261,8 @@ def test_the_error_is_the_strain_less_what_was_expected_for_it(kind, horizon):
     _, expected, errors = after(kind, strains, horizon=horizon)
     later = round(horizon / DT)
     # The clock adds up the steps, so that the first may come a tick late.
-    assert errors[later + 1 :] == pytest.approx((strains[later:] - expected[:-later])[1:])
+    checked = errors[later + 1 :]  # noqa: E203
+    assert checked == pytest.approx((strains[later:] - expected[:-later])[1:])
     assert not errors[:later].any()
 
 

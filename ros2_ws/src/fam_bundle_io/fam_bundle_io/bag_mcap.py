@@ -172,7 +172,7 @@ class _Mcap:
                 numbers.setdefault(key, []).append(count)
                 count += 1
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self.note(opcode, data[begin : begin + length], at)
+                self.note(opcode, data[begin : begin + length], at)  # noqa: E203
             place = begin + length
         self.unchecked += 0 if checked else count - self.count
         self.count = count
@@ -206,7 +206,7 @@ class _Mcap:
             heads['received'].astype(np.int64),
             heads['published'].astype(np.int64),
             heads['sequence'].astype(np.int64),
-            whole[:, MESSAGE_HEAD.itemsize :],
+            whole[:, MESSAGE_HEAD.itemsize :],  # noqa: E203
             channel.metadata.get('offered_qos_profiles', ''),
             channel.metadata.get('topic_type_hash', ''),
         )
@@ -415,7 +415,7 @@ def _summary_of(file: BinaryIO) -> Summary:
     while at < len(data):
         opcode, length = HEAD.unpack_from(data, at)
         at += HEAD.size
-        stream = ReadDataStream(BytesIO(data[at : at + length]))
+        stream = ReadDataStream(BytesIO(data[at : at + length]))  # noqa: E203
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(stream)
             schemas[schema.id] = schema

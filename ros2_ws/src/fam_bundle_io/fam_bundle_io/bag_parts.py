@@ -31,7 +31,7 @@ class Messages(NamedTuple):
     """
 
     topic: str
-    type: str
+    type: str  # noqa: A003
     definition: str
     numbers: np.ndarray
     received: np.ndarray

@@ -28,8 +28,8 @@ BATCH = 50_000  # messages that are taken together
 
 class _Topic(NamedTuple):
     name: str
-    type: str
-    format: str
+    type: str  # noqa: A003
+    format: str  # noqa: A003
     definition: str
     qos: str
     type_hash: str

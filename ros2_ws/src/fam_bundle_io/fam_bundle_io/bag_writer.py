@@ -52,7 +52,7 @@ class Topic(NamedTuple):
     """
 
     name: str
-    type: str
+    type: str  # noqa: A003
     definition: str
     type_hash: str = ''
     qos: tuple[Mapping[str, Any], ...] = ()

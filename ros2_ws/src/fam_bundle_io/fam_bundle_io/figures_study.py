@@ -201,7 +201,7 @@ def heat_map_figure(
         _draw_cells(axes, values, chatter, quantity, image)
         axes.set_title(name)
         _draw_ticks(axes, ticks[x], ticks[y])
-    for axes in list(panels.flat)[len(found) :]:
+    for axes in list(panels.flat)[len(found) :]:  # noqa: E203
         axes.set_visible(False)
     for axes in panels[-1]:
         axes.set_xlabel(axis_words(x))

@@ -62,7 +62,7 @@ class _Run(NamedTuple):
         return float(np.abs(self.error()[self.after()]).max())
 
     def overshoot(self) -> float:
-        return float(-self.error()[self.up : self.down + 1].min())
+        return float(-self.error()[self.up : self.down + 1].min())  # noqa: E203
 
     def saturation_after(self) -> float:
         """Return the share of the ticks after the upshift at which MU1 is at the source."""
@@ -195,7 +195,7 @@ def _pressure_claims(configuration: Configuration, lag: _Run, both: _Run) -> lis
 
     def raised(run: _Run) -> float:
         first = run.signal('mu_pressure')[:, 0]
-        return float(first[run.up : run.up + window].mean() - first[run.up])
+        return float(first[run.up : run.up + window].mean() - first[run.up])  # noqa: E203
 
     gain = raised(both) - raised(lag)
     noticeable = 0.01 * configuration.source.nominal_pressure

@@ -75,7 +75,7 @@ for _topic in TOPICS.values():
 
 
 def number(seed: int) -> float:
-    """A number all bits of which are in use."""
+    """Return a number all bits of which are in use."""
     return math.sin(seed) * 10.0 ** (seed % 13 - 6)
 
 
@@ -112,7 +112,8 @@ def loop(ticks: Iterable[int] = range(TICKS), begin: int = START) -> Iterator[It
 def with_tick(item: Item, tick: int) -> Item:
     """Return the message with another tick; all its other numbers stay."""
     at = 4 + 24  # behind the header
-    return item._replace(data=item.data[:at] + tick.to_bytes(8, 'little') + item.data[at + 8 :])
+    rest = item.data[at + 8 :]  # noqa: E203
+    return item._replace(data=item.data[:at] + tick.to_bytes(8, 'little') + rest)
 
 
 ITEMS = list(loop())

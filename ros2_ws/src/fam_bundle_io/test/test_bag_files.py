@@ -41,7 +41,7 @@ START = 10**18  # ns
 
 
 def number_at(index: int) -> float:
-    """A number whose bits are all in use."""
+    """Return a number whose bits are all in use."""
     return math.sin(index) * 10.0 ** (index % 40 - 20)
 
 
@@ -64,7 +64,7 @@ def messages(count: int = COUNT) -> Iterator[tuple[str, int, bytes]]:
 
 
 def assert_beginning(tables: dict[str, pd.DataFrame], least: int = 0) -> None:
-    """The tables hold what was written first, without a gap, to the last bit."""
+    """Assert that the tables hold the first messages without a gap, to the last bit."""
     for topic, first in (('/wrench', START), ('/text', START + 1)):
         table = tables.get(topic, pd.DataFrame())
         count = len(table)
@@ -279,7 +279,7 @@ def write_as_rosbag2(folder: Path, preset: str, count: int = COUNT) -> None:
 
 
 def rosbag2_information(name: str, count: int) -> dict[str, Any]:
-    """What rosbag2_storage/yaml.hpp encodes in version 9."""
+    """Return what rosbag2_storage/yaml.hpp encodes in version 9."""
     extent = {
         'starting_time': {'nanoseconds_since_epoch': START},
         'duration': {'nanoseconds': 2 * count - 1},

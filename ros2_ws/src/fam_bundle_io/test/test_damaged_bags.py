@@ -261,7 +261,7 @@ def test_a_file_that_grows_while_it_is_read_is_still_being_written(
     parts = read_mcap(file, 0)
     found = [next(parts)]
     with file.open('ab') as stream:
-        stream.write(content[begin + 5 :])
+        stream.write(content[begin + 5 :])  # noqa: E203
     found += parts
     (damage,) = [part.words for part in found if isinstance(part, Damage)]
     assert damage.endswith(' messages: it was still being written')

@@ -22,6 +22,8 @@ import damage
 from fam_bundle_io.bag_writer import Item
 import pytest
 
+pytestmark = pytest.mark.alone
+
 TICKS = 200_000  # a third of ten minutes
 TEN_MINUTES = 600_000
 LIMIT = 1_000_000_000  # bytes
@@ -38,7 +40,6 @@ RECOVER = """
 import pathlib, resource, sys
 from fam_bundle_io.recover import recover_bag
 
-pytestmark = pytest.mark.alone
 bag = pathlib.Path(sys.argv[1])
 recovery = recover_bag(bag, bag.with_name('out'))
 count = recovery.topics['/bundle_state']['count']

@@ -36,7 +36,7 @@ def trace(reference: Array, shifts: Sequence[tuple[float, int]], start: int = 1)
     made['strain_reference'] = reference
     made['recruitment_state'][:] = start
     for time, state in shifts:
-        made['recruitment_state'][round(time / TICK) :] = state
+        made['recruitment_state'][round(time / TICK) :] = state  # noqa: E203
     return made
 
 

@@ -145,7 +145,7 @@ def test_a_chunk_that_is_lost_in_the_middle_shows_in_the_ledger(tmp_path: Path) 
     bag = damage.write_bag(tmp_path / 'bag')
     file = bag / 'bag_0.mcap'
     content = bytearray(file.read_bytes())
-    content[len(content) // 2 - 50 : len(content) // 2 + 50] = bytes(100)
+    content[len(content) // 2 - 50 : len(content) // 2 + 50] = bytes(100)  # noqa: E203
     file.write_bytes(content)
     recovery = recover_bag(bag, tmp_path / 'out')
     state = recovery.topics['/bundle_state']

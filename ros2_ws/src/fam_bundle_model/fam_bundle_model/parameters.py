@@ -441,14 +441,17 @@ class Configuration:
         """Return the number of ticks of the run."""
         return round(self.duration() / self.simulation.period)
 
-    def hash(self, *groups: str) -> str:
+    def hash(self, *groups: str) -> str:  # noqa: A003
         """Return a SHA-256 over the values of the named groups, or of all that shape a result."""
         names = groups or [name for name in GROUPS if name not in ('run', 'process', 'bridge')]
         chosen = {name: dataclasses.asdict(getattr(self, name)) for name in names}
         return hashlib.sha256(json.dumps(chosen, sort_keys=True).encode()).hexdigest()
 
 
-GROUPS: dict[str, type] = {f.name: f.type for f in dataclasses.fields(Configuration)}  # type: ignore[misc]
+GROUPS: dict[str, type] = {
+    f.name: f.type  # type: ignore[misc]
+    for f in dataclasses.fields(Configuration)
+}
 
 
 def make_configuration(

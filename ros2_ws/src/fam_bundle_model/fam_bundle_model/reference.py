@@ -111,7 +111,7 @@ def _sum_of_sines(p: ReferenceParameters) -> Reference:
 
 
 def _chirp(p: ReferenceParameters) -> Reference:
-    """The frequency rises or falls evenly over the whole duration."""
+    """Let the frequency rise or fall evenly over the whole duration."""
     sweep = (p.final_frequency - p.frequency) / p.duration()
     return _sines(p, [(p.amplitude, p.frequency, sweep)])
 
@@ -123,7 +123,7 @@ def _ramp(p: ReferenceParameters) -> Reference:
 
 
 def _trapezoid(p: ReferenceParameters) -> Reference:
-    """A quarter of a cycle each: up, held, down, held."""
+    """Spend a quarter of a cycle each: up, held, down, held."""
     quarter, peak = 0.25 / p.frequency, 2.0 * p.amplitude
     rows = [[0.0, peak / quarter], [peak], [peak, -peak / quarter], [0.0]]
     breaks = [k * quarter for k in range(4)]
@@ -186,7 +186,7 @@ def _samples(p: ReferenceParameters) -> Reference:
 
 
 def _topic(p: ReferenceParameters) -> Reference:
-    """The first strain is held; what comes on the topic takes its place."""
+    """Hold the first strain; what comes on the topic takes its place."""
     return still(p.strains[0])._replace(end=p.duration())
 
 

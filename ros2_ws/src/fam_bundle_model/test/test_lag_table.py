@@ -67,7 +67,7 @@ def test_a_higher_deslack_pressure_takes_no_less_time(table, coarse):
     for row in table.lag.reshape(-1, table.lag.shape[-1]):
         reached = row[np.isfinite(row)]
         assert np.all(np.diff(reached) >= -tick)
-        assert np.all(np.isinf(row[len(reached) :]))  # once never, always never
+        assert np.all(np.isinf(row[len(reached) :]))  # once never, always never  # noqa: E203
 
 
 def test_a_higher_source_pressure_takes_no_more_time(table, coarse):

@@ -84,7 +84,7 @@ class LoopNode(Node):
 
     @property
     def counts(self) -> TickCounts:
-        """What went wrong with the messages of this node."""
+        """Return what went wrong with the messages of this node."""
         return self.meter.counts
 
     def loop_publisher(self, message_type: type, topic: str) -> Publisher:

@@ -72,10 +72,10 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
         rclpy.try_shutdown()
         return INTERRUPTED
     except RCLError as error:
-        if rclpy.get_default_context().is_valid() or not ends.told:
-            print(' '.join(str(error).split()), file=sys.stderr)  # a file missing or no YAML
-            return 2
-        return INTERRUPTED
+        if ends.told:
+            return INTERRUPTED
+        print(' '.join(str(error).split()), file=sys.stderr)  # a file that is missing or no YAML
+        return 2
     done = first_done(nodes)
     ends.raised = False  # in a callback, the executor would make a fatal error of it
     try:

@@ -122,7 +122,7 @@ def test_stray_tick_is_refused_and_hides_nothing_that_follows(story):
 
 def test_a_first_tick_that_is_a_stray_does_not_hide_the_rest(counts):
     live = list(range(70, 90))
-    assert admitted([10**9, *live], counts) == [10**9, *live[CONFIRMED - 1 :]]
+    assert admitted([10**9, *live], counts) == [10**9, *live[CONFIRMED - 1 :]]  # noqa: E203
 
 
 @pytest.mark.parametrize('last', [1, 15, 21, 10**9])
@@ -136,14 +136,14 @@ def test_restart_at_0_is_followed_at_once(last, counts):
 def test_jump_is_followed_once_ticks_in_a_row_confirm_it(distance):
     assume(distance <= -CONFIRMED or distance > 0)  # else it runs into what is expected
     counts, stream = TickCounts(), range(BASE + distance, BASE + distance + 30)
-    assert admitted(stream, counts, last=BASE) == list(stream[CONFIRMED - 1 :])
+    assert admitted(stream, counts, last=BASE) == list(stream[CONFIRMED - 1 :])  # noqa: E203
     assert counts.out_of_order == CONFIRMED - 1
     assert counts.missing == 0 or distance > 0  # nothing is missed on the way back
 
 
 def test_jump_back_is_followed_after_a_stray_from_the_future(counts):
     back = list(range(5, 20))
-    assert admitted([10**9, *back], counts, last=10**6) == back[CONFIRMED - 1 :]
+    assert admitted([10**9, *back], counts, last=10**6) == back[CONFIRMED - 1 :]  # noqa: E203
 
 
 @pytest.mark.parametrize('strays', [(99, 7), (99, 98, 97), (50, 50, 50), (90, 91, 90, 91)])

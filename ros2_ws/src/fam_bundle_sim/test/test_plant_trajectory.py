@@ -41,7 +41,7 @@ def run(rig, state, steps, substeps, every=1):
             plant_step(rig, state, command, PERIOD, substeps)
             strain = truth(rig, state, pressure).strain
             rows.append([strain, *pressure])
-    return np.array(rows)[every - 1 :: every]
+    return np.array(rows)[every - 1 :: every]  # noqa: E203
 
 
 def series_flow(hydraulics, spool, source, pressure):

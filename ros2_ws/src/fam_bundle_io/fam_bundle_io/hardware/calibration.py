@@ -60,7 +60,7 @@ TYPES = (*LIVE_ZERO, 'bipolar', 'frequency')
 class _Sensor:
     """What every sensor has."""
 
-    type: str = choice('kind of signal; the first two have a live zero', TYPES)
+    type: str = choice('kind of signal; the first two have a live zero', TYPES)  # noqa: A003
     channel: int = integer('number of the analogue input on the card', 0, 255)
     minimum_volts: float = number('V', 'range of the input', minimum=-100.0, maximum=100.0)
     maximum_volts: float = number('V', 'range of the input', minimum=-100.0, maximum=100.0)
@@ -131,7 +131,7 @@ Sensor = SensorCalibration | FlowCalibration
 class Calibration:
     """All channels of a rig; one pressure and one valve for each motor unit."""
 
-    id: str
+    id: str  # noqa: A003
     strain: SensorCalibration
     force: SensorCalibration
     source_pressure: SensorCalibration
@@ -148,7 +148,7 @@ class Calibration:
         """Return the names of all sensors in the order of the inputs."""
         return (*QUANTITIES, *(f'mu_pressure[{i}]' for i in range(len(self.mu_pressure))))
 
-    def hash(self) -> str:
+    def hash(self) -> str:  # noqa: A003
         """Return a SHA-256 over all values: the same for the same numbers, however written."""
         values = dataclasses.asdict(self)
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

@@ -101,7 +101,7 @@ class Monitor:
 
     @property
     def state(self) -> State:
-        """The state: valves follow commands when it is active, and in no other."""
+        """Return the state: valves follow commands when it is active, and in no other."""
         return self._safety.state
 
     @property
@@ -111,7 +111,7 @@ class Monitor:
 
     @property
     def sample(self) -> Sample:
-        """What the newest tick gave, with the state of now."""
+        """Return what the newest tick gave, with the state of now."""
         return self._report()
 
     @property

@@ -17,12 +17,6 @@
 import contextlib
 import dataclasses
 from pathlib import Path
-import sys
-
-import numpy as np
-import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 import fake_nidaqmx
 import fake_quanser
@@ -30,6 +24,8 @@ from fam_bundle_io.hardware import backend
 from fam_bundle_io.hardware.backend import load_backend, make_setup
 from fam_bundle_io.hardware.calibration import load_hardware
 from fam_bundle_model.parameters import load_configuration
+import numpy as np
+import pytest
 
 CONFIG = Path(__file__).parents[3] / 'fam_bundle_bringup' / 'config'
 PERIOD = 0.001
@@ -45,7 +41,7 @@ def configuration():
 
 @pytest.fixture(scope='session')
 def hardware():
-    """The simulated rig, one valve with its middle off, the other wired the other way."""
+    """Return the simulated rig, one valve off its middle, the other wired the other way."""
     found = load_hardware(CONFIG / 'volts_calibration.yaml')
     first, second = found.calibration.valves
     valves = (
@@ -97,6 +93,8 @@ class Bench:
 
 
 class MockBench(Bench):
+    """The mock card, whose terminals are set by hand."""
+
     def let_pass(self, seconds):
         if seconds > self.setup.watchdog_timeout:
             self.backend.expire()
@@ -109,6 +107,8 @@ class MockBench(Bench):
 
 
 class VoltsBench(Bench):
+    """The simulated rig in volts, in this process."""
+
     def let_pass(self, seconds):
         for _ in range(round(seconds / PERIOD) + 1):
             with contextlib.suppress(OSError):
@@ -122,6 +122,8 @@ class VoltsBench(Bench):
 
 
 class QuanserBench(Bench):
+    """Quanser's card, with a fake in place of its module."""
+
     def __init__(self, name, hardware, configuration, monkeypatch):
         super().__init__(name, hardware, configuration)
         self.board = fake_quanser.install(monkeypatch)
@@ -143,6 +145,8 @@ class QuanserBench(Bench):
 
 
 class NidaqmxBench(Bench):
+    """A card of National Instruments, with a fake in place of its module."""
+
     def __init__(self, name, hardware, configuration, monkeypatch):
         super().__init__(name, hardware, configuration)
         self.device = fake_nidaqmx.install(monkeypatch)

@@ -40,6 +40,8 @@ class DaqNotFoundError(Error):
 
 
 class DaqError(Error):
+    """What a call of the driver raises."""
+
     def __init__(self, message, error_code):
         super().__init__(message)
         self.error_code = error_code
@@ -109,6 +111,8 @@ def number(channel, kind):
 
 
 class Channels:
+    """The channels of a task, of one kind."""
+
     def __init__(self, kind):
         self.kind, self.ranges = kind, {}
 
@@ -123,6 +127,8 @@ class Channels:
 
 
 class Timing:
+    """The sample clock of a task."""
+
     def __init__(self):
         self.rate, self.mode = None, None
 
@@ -131,6 +137,8 @@ class Timing:
 
 
 class Stream:
+    """The data of a task on their way in."""
+
     def __init__(self, task):
         self.task = task
         self.relative_to = ReadRelativeTo.CURRENT_READ_POSITION
@@ -139,6 +147,8 @@ class Stream:
 
 
 class Task:
+    """A task: channels, clock and state."""
+
     def __init__(self):
         if not device.driver:
             raise DaqNotFoundError('Could not find an installation of NI-DAQmx.')
@@ -176,6 +186,8 @@ def check(data, size):
 
 
 class AnalogMultiChannelReader:
+    """Reads from the stream of a task."""
+
     def __init__(self, stream):
         self.task = stream.task
 
@@ -191,6 +203,8 @@ class AnalogMultiChannelReader:
 
 
 class AnalogMultiChannelWriter:
+    """Writes to the stream of a task."""
+
     def __init__(self, stream, auto_start=False):
         self.task, self.auto_start = stream.task, auto_start
 
@@ -209,6 +223,8 @@ class AnalogMultiChannelWriter:
 
 
 class WatchdogTask(Task):
+    """Puts the expiration states out when it is not reset in time."""
+
     def __init__(self, device_name, task_name='', timeout=10):
         super().__init__()
         if device_name != 'Fake1':

@@ -29,6 +29,8 @@ OVERFLOW, NOT_FOUND, EXPIRATION_UNSUPPORTED, EXPIRED, NOT_EXPIRED = -111, -108, 
 
 
 class HILError(Exception):
+    """What a call of the card raises."""
+
     def __init__(self, error_code, words):
         super().__init__(words)
         self.error_code = error_code

@@ -26,7 +26,7 @@ from fam_bundle_io.hardware.backend import load_backend
 from fam_bundle_sim.volts_card import read_log
 import numpy as np
 import pytest
-from test_backend_contract import *  # noqa: F403  the same sentences
+from test_backend_contract import *  # noqa  the same sentences
 from test_backend_contract import OPEN
 
 pytestmark = pytest.mark.alone
@@ -53,6 +53,8 @@ def process():
 
 
 class CardBench(Bench):
+    """The card that is a process of its own."""
+
     def __init__(self, process, hardware, configuration):
         place, self.log = process
         options = {'volts_card': {'socket': str(place), 'bits': 0}}
@@ -89,7 +91,7 @@ class CardBench(Bench):
 
 @pytest.fixture
 def bench(process, hardware, configuration):
-    """The card, not configured yet."""
+    """Return the card, not configured yet."""
     found = CardBench(process, hardware, configuration)
     found.mend()  # what the test before has broken
     yield found

@@ -255,5 +255,7 @@ def test_a_run_leaves_nothing_on_the_heap(loop):
 
 
 class Forgetful(list):
+    """A list that keeps nothing."""
+
     def append(self, item):
         pass

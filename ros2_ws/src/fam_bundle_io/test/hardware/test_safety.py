@@ -208,7 +208,7 @@ def sensors(hardware):
     return found
 
 
-DEAD = {i: volts for i, volts in zip(ESSENTIAL, (9.95, 0.2, 4.8, 0.0), strict=True)}
+DEAD = dict(zip(ESSENTIAL, (9.95, 0.2, 4.8, 0.0), strict=True))
 
 
 @pytest.mark.parametrize('channel', ESSENTIAL)
