@@ -30,6 +30,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{package}']),
         (f'share/{package}', ['package.xml']),
         (f'share/{package}/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
+        (f'share/{package}/launch', sorted(glob('launch/*.launch.py'))),
         (f'share/{package}/layouts', sorted(glob('layouts/*'))),
     ],
     install_requires=['setuptools'],

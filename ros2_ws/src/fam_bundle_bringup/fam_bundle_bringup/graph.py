@@ -66,6 +66,17 @@ def own_domain() -> Iterator[int]:
         reservation.__exit__(None, None, None)
 
 
+def nodes_of(*, composed: bool = False, bridge: bool = False) -> list[tuple[str, str]]:
+    """
+    Return package and executable of each process of a bundle; the last one owns the run.
+
+    ``bridge`` asks for the hardware bridge in place of the plant simulator.
+    """
+    if composed:
+        return [COMPOSED]
+    return [*NODES[:-1], BRIDGE] if bridge else list(NODES)
+
+
 def start_nodes(
     group: NodeGroup,
     parameter_file: Path,
@@ -81,8 +92,7 @@ def start_nodes(
     ``bridge`` asks for the hardware bridge in place of the plant simulator, ``bundle`` names the
     namespace of one of several. Returns the name of the process that ends with the run.
     """
-    nodes: Sequence[tuple[str, str]] = (COMPOSED,) if composed else NODES
-    nodes = [BRIDGE if bridge and name == 'plant_simulator' else (p, name) for p, name in nodes]
+    nodes = nodes_of(composed=composed, bridge=bridge)
     for package, name in nodes:
         command = [executable(package, name), '--ros-args', '--params-file', str(parameter_file)]
         if name in OWNERS:

@@ -18,9 +18,12 @@ import os
 from pathlib import Path
 
 
-def stay_on_this_machine() -> None:
+OVERRULE = ('ROS_DISCOVERY_SERVER', 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS')  # a profile
+
+
+def loopback() -> dict[str, str]:
     """
-    Let this process and all that it starts talk over the loopback only.
+    Return the variables that keep traffic on the loopback, where none of ``OVERRULE`` is set.
 
     Raises FileNotFoundError without the profile, for the middleware would then use every network.
     """
@@ -28,9 +31,20 @@ def stay_on_this_machine() -> None:
 
     share = Path(get_package_share_directory('fam_bundle_bringup'))
     profile = (share / 'config' / 'fastdds_loopback.xml').resolve(strict=True)
-    os.environ['RMW_IMPLEMENTATION'] = 'rmw_fastrtps_cpp'  # which reads it
-    os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(profile)
-    for name in ('ROS_DISCOVERY_SERVER', 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS'):
-        os.environ.pop(name, None)  # each would overrule the profile
-    # With LOCALHOST the middleware adds transports of its own, shared memory among them.
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
+    return {
+        'RMW_IMPLEMENTATION': 'rmw_fastrtps_cpp',  # which reads it
+        'FASTRTPS_DEFAULT_PROFILES_FILE': str(profile),
+        # With LOCALHOST the middleware adds transports of its own, shared memory among them.
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SYSTEM_DEFAULT',
+    }
+
+
+def stay_on_this_machine() -> None:
+    """
+    Let this process and all that it starts talk over the loopback only.
+
+    Raises FileNotFoundError without the profile, for the middleware would then use every network.
+    """
+    os.environ.update(loopback())
+    for name in OVERRULE:
+        os.environ.pop(name, None)

@@ -43,6 +43,7 @@ from fam_bundle_io.message_definitions import complete_definition
 from fam_bundle_model.parameters import Configuration, GROUPS, ProcessParameters, yaml_text
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.declare import declare_configuration
+from fam_bundle_node.parent import end_with_parent
 from fam_bundle_node.tuning import tune
 from rcl_interfaces.msg import ParameterDescriptor
 import rclpy
@@ -454,6 +455,7 @@ def main() -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, tell)
+    end_with_parent()
     sys.exit(run(lambda: bool(told)))
 
 

@@ -22,6 +22,7 @@ from types import FrameType
 
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.loop_node import LoopNode
+from fam_bundle_node.parent import end_with_parent
 from fam_bundle_node.tuning import tune
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException
@@ -62,6 +63,7 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
     """
     ends = Interrupts()
     try:
+        end_with_parent()
         rclpy.init()
         nodes = [make_node() for make_node in makers]
     except ConfigurationError as error:
