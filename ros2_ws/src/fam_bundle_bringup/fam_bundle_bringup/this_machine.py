@@ -17,7 +17,6 @@
 import os
 from pathlib import Path
 
-
 OVERRULE = ('ROS_DISCOVERY_SERVER', 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS')  # a profile
 
 
