@@ -3,6 +3,7 @@
 
 from collections.abc import Callable, Iterator
 import dataclasses
+import math
 from pathlib import Path
 import subprocess
 import time
@@ -26,6 +27,10 @@ from rclpy.node import Node
 
 PATIENCE = 60.0  # s; only a hang takes that long
 CONFIGURATION = default_configuration()
+LIVE = {
+    'strain_controller': ('strain_loop',),
+    'recruitment_supervisor': ('recruitment',),
+}
 
 
 @pytest.fixture
@@ -133,7 +138,12 @@ def test_parameters_are_described_from_the_schema(
         declaration = declarations(GROUPS[group])[field]
         assert declaration.text in descriptor.description
         assert descriptor.additional_constraints == declaration.bound()
-        assert descriptor.read_only
+        live = declaration.live and group in LIVE.get(name, ())
+        assert descriptor.read_only == (not live)
+        ranges = [*descriptor.floating_point_range, *descriptor.integer_range]
+        bounded = math.isfinite(declaration.minimum) or math.isfinite(declaration.maximum)
+        assert len(ranges) == (bounded and not declaration.array)
+        assert all(r.from_value <= declaration.maximum for r in ranges)
 
 
 @pytest.mark.parametrize(('package', 'name'), NODES)

@@ -30,6 +30,8 @@ from typing import Any, NamedTuple, TYPE_CHECKING
 from fam_bundle_bringup.experiment import prepare_folder, versions
 from fam_bundle_bringup.json_file import write_json
 from fam_bundle_bringup.progress import progress_bar
+from fam_bundle_bringup.replay_changes import changes_of
+from fam_bundle_bringup.replay_changes import TOPIC as CHANGES
 from fam_bundle_bringup.replay_controllers import (
     ANSWERS,
     COMMAND,
@@ -113,7 +115,7 @@ def run_replay(bag: Path, config: Path | None, out: Path | None, namespace: str 
     """
     space = f'/{namespace.strip("/")}'.rstrip('/')
     found = read_bag(
-        bag, lambda name: name.rpartition('/')[2] in (SAMPLES, LAG_TABLE, LAW, *ANSWERS)
+        bag, lambda name: name.rpartition('/')[2] in (SAMPLES, LAG_TABLE, LAW, CHANGES, *ANSWERS)
     )
     chosen = choose(found, bag, config)
     tables, notes = tables_of(found, space)
@@ -221,7 +223,10 @@ def replay_of(
     answers = {topic: tables[topic] for topic in ANSWERS if topic in tables}
     begun = int(table['published'].iloc[0])
     laws, notes = tracked_laws(bag.tables.get(f'{space}/{LAW}'), begun, configuration)
-    run = Run(samples_of(table), answers, configuration.run.pace == 'realtime', laws)
+    changed = bag.tables.get(f'{space}/{CHANGES}')
+    changes, more = changes_of(changed, begun, configuration)
+    notes += more
+    run = Run(samples_of(table), answers, configuration.run.pace == 'realtime', laws, changes)
     for topic, found in answers.items():
         lacking = len(table.index.difference(found.index))
         if lacking and not run.realtime:

@@ -24,8 +24,10 @@ answer is in the bag, and no other: a law takes its step and the answer is publi
 import bisect
 from collections.abc import Callable, Container, Iterable, Mapping
 import dataclasses
+from types import MappingProxyType
 from typing import Any, NamedTuple, TYPE_CHECKING
 
+from fam_bundle_bringup.replay_changes import Change, Changing
 from fam_bundle_control.announced import Announced, Announcement, NOTICE
 from fam_bundle_control.pressure_loop import pressure_loop, pressure_loop_step
 from fam_bundle_control.recruitment import (
@@ -34,7 +36,12 @@ from fam_bundle_control.recruitment import (
     recruitment_step,
     RecruitmentOutput,
 )
-from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
+from fam_bundle_control.strain_loop import (
+    strain_loop,
+    strain_loop_retuned,
+    strain_loop_start,
+    strain_loop_step,
+)
 from fam_bundle_io.bag_writer import BagError
 from fam_bundle_model.bundle import motor_units
 from fam_bundle_model.compile import direct
@@ -105,13 +112,15 @@ class Run(NamedTuple):
     """
     One run: its samples, the tables of what answered them by topic and tick, and its pace.
 
-    ``laws`` are the trajectories that were tracked, that of the beginning first.
+    ``laws`` are the trajectories that were tracked, that of the beginning first; ``changes`` the
+    parameters that were set meanwhile, by node.
     """
 
     samples: Samples
     answers: 'Mapping[str, pd.DataFrame]'
     realtime: bool
     laws: list[Announcement]
+    changes: Mapping[str, list[Change]] = MappingProxyType({})
 
 
 def samples_of(table: 'pd.DataFrame') -> Samples:
@@ -224,8 +233,12 @@ def strain_answers(
     measured = (0.0, 0.0, 0.0, np.zeros(len(units)), 1.0)
     step = direct(strain_loop_step, law, units, state, *measured)
     rows = []
+    changing, error = Changing(configuration, run.changes.get('strain_controller', [])), 0.0
     for row, dt, anew, _ in zip(*steps, strict=True):
         now = nanoseconds(samples.stamp[row])
+        if changing.at(samples.tick[row]):
+            before, law = law, strain_loop(changing.now)
+            state = strain_loop_retuned(state, error, before, law)
         reference = strain_reference(tracked.at(now).law, seconds(now))
         state, output = step(
             law,
@@ -237,6 +250,7 @@ def strain_answers(
             samples.mu_pressure[row],
             dt,
         )
+        error = output.error
         rows.append((reference, *output))
         progress(len(rows))
     fields = ('strain_reference', 'strain_error', 'pressure', 'pressure_unlimited')
@@ -251,7 +265,8 @@ def supervisor_answers(
     progress: Progress,
 ) -> Columns:
     """Return what the recruitment supervisor answers with the lag table ``table``."""
-    laws = [recruitment(configuration, live=live) for live in (False, True)]
+    changing = Changing(configuration, run.changes.get('recruitment_supervisor', []))
+    laws = [recruitment(changing.now, live=live) for live in (False, True)]
     samples, units, memory = run.samples, motor_units(configuration), recruitment_start()
     foreseen = announced(run.laws, NOTICE)
     none = np.zeros(len(units))
@@ -261,6 +276,8 @@ def supervisor_answers(
     for row, dt, anew, _ in zip(*steps, strict=True):
         now = nanoseconds(samples.stamp[row])
         known = foreseen.at(now)
+        if changing.at(samples.tick[row]):
+            laws = [recruitment(changing.now, live=live) for live in (False, True)]
         memory, output = decide(
             laws[known.live],
             units,

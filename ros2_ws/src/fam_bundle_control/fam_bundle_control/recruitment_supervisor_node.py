@@ -42,12 +42,14 @@ import numpy as np
 class RecruitmentSupervisor(Controller):
     """Waits for the lag table, then decides at each tick."""
 
+    LIVE = ('recruitment',)
+
     def __init__(self) -> None:
         """Wait for the table."""
         super().__init__(
             'recruitment_supervisor', ('recruitment', 'allocation', 'reference', *PHYSICS)
         )
-        self.laws = [recruitment(self.configuration, live=live) for live in (False, True)]
+        self.retune()
         self.units = motor_units(self.configuration)
         reference = self.configuration.reference
         self.first = Announcement(BEGINNING, reference_law(reference), reference.kind == LIVE)
@@ -59,6 +61,10 @@ class RecruitmentSupervisor(Controller):
         self.create_subscription(LagTableMessage, 'lag_table', self.on_lag_table, LATCHED)
         if self.configuration.recruitment.predictor == 'preview':
             self.create_subscription(ReferenceMessage, 'reference', self.on_reference, CHANGES)
+
+    def retune(self) -> None:
+        """Decide by the settings of now; filters and what is recruited stay."""
+        self.laws = [recruitment(self.configuration, live=live) for live in (False, True)]
 
     def restart(self) -> None:
         """Find the recruited motor units from their pressures."""

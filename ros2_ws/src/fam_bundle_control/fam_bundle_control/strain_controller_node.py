@@ -20,7 +20,12 @@ import time
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from fam_bundle_control.strain_loop import strain_loop, strain_loop_start, strain_loop_step
+from fam_bundle_control.strain_loop import (
+    strain_loop,
+    strain_loop_retuned,
+    strain_loop_start,
+    strain_loop_step,
+)
 from fam_bundle_control.trajectory import goal_parameters, RETURN, Score, Trajectory
 from fam_bundle_model.bundle import motor_units, reachable
 from fam_bundle_model.compile import direct
@@ -49,6 +54,8 @@ WARNING_PERIOD = 1.0  # s between two warnings of live values that are not taken
 
 class StrainController(Controller):
     """Owns the reference trajectory and the outer PI."""
+
+    LIVE = ('strain_loop',)
 
     def __init__(self) -> None:
         """Compile the law before the first tick needs it."""
@@ -93,6 +100,12 @@ class StrainController(Controller):
             cancel_callback=self.on_cancel,
         )
         self.loop_subscription(BundleState, 'bundle_state', self.on_bundle_state)
+
+    def retune(self) -> None:
+        """Take new gains over; the integral share makes up for the proportional one."""
+        before, self.law = self.law, strain_loop(self.configuration)
+        error = self.message.strain_error
+        self.state_of_law = strain_loop_retuned(self.state_of_law, error, before, self.law)
 
     def restart(self) -> None:
         """Set in at the first motor unit's measured pressure."""

@@ -82,6 +82,19 @@ def strain_loop_start() -> StrainLoopState:
     return StrainLoopState(0.0, False)
 
 
+def strain_loop_retuned(
+    state: StrainLoopState, error: float, before: StrainLoop, after: StrainLoop
+) -> StrainLoopState:
+    """
+    Return ``state`` for the law ``after`` in place of ``before``, at the last strain ``error``.
+
+    The integral share takes over what the proportional one loses (Pa), so that the output has no
+    jump of its own: at the same error both laws ask for the same.
+    """
+    moved = (before.proportional - after.proportional) * error
+    return StrainLoopState(state.integral + moved, state.started)
+
+
 @compiled
 def strain_loop_step(
     law: StrainLoop,

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from fam_bundle_control.strain_loop import (
     strain_loop,
+    strain_loop_retuned,
     strain_loop_start,
     strain_loop_step,
     StrainLoop,
@@ -141,3 +142,22 @@ def test_anti_windup_returns_from_saturation_without_a_long_undershoot():
     wound_up = np.flatnonzero(closed_loop(law._replace(tracking_time=1e9), 8.0)[2000:] > 0.055)
     assert above.max() * DT < 0.3 < 1.0 < wound_up.max() * DT
     assert strain[-1] == pytest.approx(0.05, abs=1e-3)
+
+
+@given(
+    gain=st.floats(0.0, 1e8),
+    integral=st.floats(0.0, 1e9),
+    tracking=st.floats(1e-3, 10.0),
+    error=st.floats(-0.01, 0.01),
+)
+@settings(max_examples=50, deadline=None)
+def test_new_gains_set_in_without_a_bump(gain, integral, tracking, error):
+    errors = [error] * 50
+    _, state = run(LAW, errors)
+    before, _ = run(LAW, [error], state=state)
+    law = LAW._replace(proportional=gain, integral=integral, tracking_time=tracking)
+    after, _ = run(law, [error], state=strain_loop_retuned(state, error, LAW, law))
+    assert after[0].unlimited == pytest.approx(before[0].unlimited, rel=1e-12, abs=1e-6)
+    bumped, _ = run(law, [error], state=state)
+    jump = (gain - LAW.proportional) * error
+    assert bumped[0].unlimited - after[0].unlimited == pytest.approx(jump, rel=1e-9, abs=1e-6)

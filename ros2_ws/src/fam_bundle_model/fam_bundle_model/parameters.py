@@ -148,9 +148,15 @@ class LoadParameters:
 class StrainLoopParameters:
     """Outer PI on strain; its output is the pressure reference (Figure 3a)."""
 
-    proportional_gain: float = number('Pa', 'pressure per unit strain error', minimum=0.0)
-    integral_gain: float = number('Pa/s', 'pressure rate per unit strain error', minimum=0.0)
-    tracking_time: float = positive('s', 'time constant of the back-calculation anti-windup')
+    proportional_gain: float = number(
+        'Pa', 'pressure per unit strain error', minimum=0.0, live=True
+    )
+    integral_gain: float = number(
+        'Pa/s', 'pressure rate per unit strain error', minimum=0.0, live=True
+    )
+    tracking_time: float = positive(
+        's', 'time constant of the back-calculation anti-windup', live=True
+    )
 
 
 @dataclass(frozen=True)
@@ -174,15 +180,23 @@ class RecruitmentParameters:
 
     scheme: str = choice('what decides a shift, and what is compensated', SCHEMES)
     upshift_threshold: float = number(
-        '', 'share of the nominal pressure that shifts up', minimum=0.05, maximum=1.0
+        '',
+        'share of the nominal pressure that shifts up',
+        minimum=0.05,
+        maximum=1.0,
+        live=True,
     )
     downshift_threshold: float = number(
-        '', 'share of the nominal pressure that shifts down', minimum=0.0, maximum=0.95
+        '',
+        'share of the nominal pressure that shifts down',
+        minimum=0.0,
+        maximum=0.95,
+        live=True,
     )
-    strain_rate_time_constant: float = positive('s', 'filter of the strain rate')
-    force_time_constant: float = positive('s', 'filter of the measured force')
-    minimum_strain_rate: float = positive('1/s', 'slower is taken as standing still')
-    minimum_dwell: float = number('s', 'least time between two shifts', minimum=0.0)
+    strain_rate_time_constant: float = positive('s', 'filter of the strain rate', live=True)
+    force_time_constant: float = positive('s', 'filter of the measured force', live=True)
+    minimum_strain_rate: float = positive('1/s', 'slower is taken as standing still', live=True)
+    minimum_dwell: float = number('s', 'least time between two shifts', minimum=0.0, live=True)
     reserve: float = number(
         'Pa',
         'source pressure kept in reserve by the prediction: more recruits earlier and tracks '
@@ -190,6 +204,7 @@ class RecruitmentParameters:
         default=0.0,
         minimum=-5e5,
         maximum=5e5,
+        live=True,
     )
     predictor: str = choice(
         'how the strain is expected to go on', PREDICTORS, default='constant_rate'
@@ -485,6 +500,25 @@ def make_configuration(
     if configuration.run is not None and configuration.simulation is not None:
         check_run(configuration.run, configuration.simulation)
     return configuration
+
+
+def with_values(configuration: Configuration, values: Mapping[str, Any]) -> Configuration:
+    """
+    Return ``configuration``, of all groups or some, with ``values['group.name']`` laid over it.
+
+    Raises ConfigurationError naming the parameter, its value and the bound.
+    """
+    groups = {
+        name: dataclasses.asdict(group)
+        for name in GROUPS
+        if (group := getattr(configuration, name)) is not None
+    }
+    for name, value in values.items():
+        group, _, field = name.partition('.')
+        if group not in groups:
+            raise ConfigurationError(unknown(name, list(groups)))
+        groups[group][field] = value
+    return make_configuration(groups, groups)
 
 
 def check_allocation(recruitment: RecruitmentParameters, allocation: AllocationParameters) -> None:

@@ -41,7 +41,8 @@ class Declaration:
     ``unit`` is an SI unit or empty; ``minimum`` and ``maximum`` bound the value, and
     ``exclusive`` says that the minimum itself is not allowed. ``kind`` is ``float``, ``int``,
     ``bool`` or ``str``; ``array`` marks one value per motor unit (a single value serves all), or
-    with ``series`` a row of its own length.
+    with ``series`` a row of its own length. ``live`` says that it may
+    change while its loop runs.
     """
 
     kind: type
@@ -53,6 +54,7 @@ class Declaration:
     choices: tuple[str, ...] = ()
     array: bool = False
     series: bool = False
+    live: bool = False
 
     def is_free_text(self) -> bool:
         """Return whether any text will do that is not blank."""
@@ -124,13 +126,13 @@ def _field(declaration: Declaration, default: Any) -> Any:
 
 
 def number(unit: str, text: str, *, default: float | None = None, **bounds: Any) -> Any:
-    """Declare a float in ``unit``; ``bounds`` are ``minimum``, ``maximum``, ``exclusive``."""
+    """Declare a float in ``unit``; ``bounds`` are as in Declaration, ``live`` too."""
     return _field(Declaration(float, unit, text, **bounds), default)
 
 
-def positive(unit: str, text: str, *, default: float | None = None) -> Any:
+def positive(unit: str, text: str, *, default: float | None = None, live: bool = False) -> Any:
     """Declare a float that must be greater than zero."""
-    return number(unit, text, default=default, minimum=0.0, exclusive=True)
+    return number(unit, text, default=default, minimum=0.0, exclusive=True, live=live)
 
 
 def integer(text: str, minimum: int, maximum: int, *, default: int | None = None) -> Any:

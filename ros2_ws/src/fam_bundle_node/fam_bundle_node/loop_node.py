@@ -19,12 +19,15 @@ import re
 import time
 from typing import Any
 
-from fam_bundle_model.parameters import Configuration
+from fam_bundle_model.parameters import Configuration, with_values
 from fam_bundle_model.schema import ConfigurationError
+from fam_bundle_msgs.msg import ParameterChange
 from fam_bundle_node.checks import CHECKS
 from fam_bundle_node.declare import declare_configuration
+from fam_bundle_node.live import changes_of
 from fam_bundle_node.loop_meter import LoopMeter
 from fam_bundle_node.qos import (
+    CHANGES,
     LOOP_PUBLISHER,
     LOOP_SUBSCRIPTION,
     REALTIME_PUBLISHER,
@@ -34,9 +37,11 @@ from fam_bundle_node.stamps import begins_anew, StampClock
 from fam_bundle_node.statistics_publisher import StatisticsPublisher
 from fam_bundle_node.steady_timer import SteadyTimer
 from fam_bundle_node.ticks import Strikes, TickCounts, TickError, TickFilter, TickOrder
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.task import Future
 
@@ -61,19 +66,23 @@ class LoopNode(Node):
     """
 
     OWNS_RUN = False  # whether a run begins and ends with this node
+    LIVE: tuple[str, ...] = ()  # groups whose live parameters can be set while it runs
 
     def __init__(self, name: str, groups: Iterable[str]) -> None:
         """Declare the parameters of ``groups``; raises ConfigurationError when one is bad."""
         super().__init__(name)
         self.done: Future = Future()
         self.trouble = ''
+        self.changed: dict[str, float] = {}  # parameters since the last sample
         self.meter = LoopMeter()
         self._order = TickOrder()
         self._strikes = Strikes()
         self._newest = 0  # steady time of a sample (ns)
         self._publishers_of_loop: list[Publisher] = []
         try:
-            self.configuration: Configuration = declare_configuration(self, (*groups, *COMMON))
+            self.configuration: Configuration = declare_configuration(
+                self, (*groups, *COMMON), self.LIVE
+            )
         except ConfigurationError:
             self.destroy_node()
             raise
@@ -81,6 +90,26 @@ class LoopNode(Node):
         self.statistics = StatisticsPublisher(self, self.meter)
         self._shown, self._reported_at = 'running', time.monotonic()
         self._look = SteadyTimer(self, LOOK_PERIOD, self.look_after, self.fail_on)
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """
+        Set parameters, all or none; what has changed acts from the next sample on.
+
+        Refused in one line that names parameter, value and bound, or why it is fixed. What keeps
+        its value is taken, so that a dump of this very node can be loaded.
+        """
+        try:
+            new = [p for p in parameter_list if self.get_parameter_or(p.name).value != p.value]
+            changed, others = changes_of(self.configuration, self.LIVE, new)
+            configuration = with_values(self.configuration, changed)
+        except ConfigurationError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        result = super().set_parameters_atomically(others)
+        if result.successful and changed:
+            self.configuration = configuration
+            self.changed |= changed
+            self.get_logger().info(f'set: {changed}')
+        return result
 
     @property
     def counts(self) -> TickCounts:
@@ -240,10 +269,26 @@ class Controller(LoopNode):
         super().__init__(name, groups)
         self.stamps = StampClock(self.configuration.period_ns())
         self._ticks, self._tick_at = 0, 0.0
+        self._changes: Publisher | None = None  # made when one is needed
 
     def restart(self) -> None:
         """Bring the law to its start, from which it sets in without a bump."""
         raise NotImplementedError
+
+    def retune(self) -> None:
+        """Go on with the law of the configuration as it is now, without a bump."""
+        raise NotImplementedError
+
+    def _take_changes(self, sample: Any) -> None:
+        """Let changed parameters act, and say from which sample on: a replay must know."""
+        self.retune()
+        names, values = list(self.changed), [float(value) for value in self.changed.values()]
+        self.changed = {}
+        if self._changes is None:
+            self._changes = self.create_publisher(ParameterChange, 'parameter_changes', CHANGES)
+        change = ParameterChange(tick=sample.tick, node=self.get_name(), names=names)
+        change.header, change.values = sample.header, values
+        self._changes.publish(change)
 
     def time_step(self, sample: Any) -> float:
         """
@@ -251,6 +296,8 @@ class Controller(LoopNode):
 
         Raises TickError when time stands still.
         """
+        if self.changed:
+            self._take_changes(sample)
         gap = self.stamps.gap(sample.header.stamp)
         timeout = self.configuration.run.command_timeout
         if begins_anew(sample.tick, sample.safe, gap, timeout):

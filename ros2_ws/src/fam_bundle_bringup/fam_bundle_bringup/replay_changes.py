@@ -1,0 +1,87 @@
+# Copyright 2026 fam_bundle maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parameters that were set while a recorded run went on."""
+
+from collections.abc import Mapping
+from typing import Any, TYPE_CHECKING
+
+from fam_bundle_model.parameters import Configuration, with_values
+from fam_bundle_model.schema import ConfigurationError
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TOPIC = 'parameter_changes'
+NEEDED = {'published', 'tick', 'node', 'names', 'values'}
+# From which tick on, and by group.name.
+Change = tuple[int, Mapping[str, float]]
+
+
+class Changing:
+    """The configuration of a node that changes from tick to tick."""
+
+    def __init__(self, configuration: Configuration, changes: list[Change]) -> None:
+        """Begin with ``configuration``; ``changes`` are in the order of ticks."""
+        self.now = configuration
+        self._due = list(changes)
+
+    def at(self, tick: int) -> bool:
+        """Make ``now`` that of ``tick``, which is later than before; return whether it changed."""
+        due = [values for since, values in self._due if since <= tick]
+        del self._due[: len(due)]
+        for values in due:
+            self.now = with_values(self.now, values)
+        return bool(due)
+
+
+def changes_of(
+    table: 'pd.DataFrame | None', begun: int, configuration: Configuration
+) -> tuple[dict[str, list[Change]], list[str]]:
+    """
+    Return the changes of each node, and notes, from the messages of ``TOPIC`` in a bag.
+
+    ``begun`` is when the run's first sample was published (ns); what was changed in an earlier
+    run acts from the beginning on.
+    """
+    found: dict[str, list[Change]] = {}
+    if table is None:
+        return found, []
+    try:
+        for row in rows_of(table):
+            tick = int(row['tick']) if row['published'] >= begun else 0
+            values = dict(zip(row['names'], row['values'], strict=True))
+            with_values(configuration, values)
+            found.setdefault(row['node'], []).append((tick, values))
+    except (ConfigurationError, ValueError, TypeError, KeyError) as error:
+        return {}, [f'{TOPIC}: damaged ({error}); changed parameters are not replayed']
+    return found, []
+
+
+def rows_of(table: 'pd.DataFrame') -> list[dict[str, Any]]:
+    """Return the messages in a table, whether or not their arrays are columns of their own."""
+    rows = []
+    for row in table.to_dict('records'):
+        arrays: dict[str, dict[int, Any]] = {'names': {}, 'values': {}}
+        for name in list(row):
+            field, _, index = str(name).rstrip(']').partition('[')
+            if index and field in arrays and row[name] == row[name] and row[name] is not None:
+                arrays[field][int(index)] = row[name]
+        for field, elements in arrays.items():
+            row.setdefault(field, [elements[k] for k in sorted(elements)])
+        missing = NEEDED - set(row)
+        if missing:
+            raise KeyError(f'no {", ".join(sorted(missing))}')
+        rows.append(row)
+    return rows
