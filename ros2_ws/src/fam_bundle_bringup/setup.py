@@ -32,6 +32,7 @@ setup(
         (f'share/{package}/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
         (f'share/{package}/launch', sorted(glob('launch/*.launch.py'))),
         (f'share/{package}/layouts', sorted(glob('layouts/*'))),
+        (f'share/{package}/security', sorted(glob('security/*.xml'))),
     ],
     install_requires=['setuptools'],
     extras_require={'test': ['pytest']},
