@@ -54,7 +54,8 @@ def install(log_dir: str) -> None:
     logger = SimpleNamespace(warning=lambda text: None)
     config = SimpleNamespace(log_dir=log_dir)
     names = ('EmitEvent', 'LogInfo', 'RegisterEventHandler', 'SetEnvironmentVariable')
-    actions = {name: type(name, (Action,), {}) for name in (*names, 'TimerAction')}
+    more = ('TimerAction', 'UnsetEnvironmentVariable')
+    actions = {name: type(name, (Action,), {}) for name in (*names, *more)}
     modules: dict[str, dict[str, Any]] = {
         'launch': {'LaunchContext': LaunchContext, 'LaunchDescription': LaunchDescription},
         'launch.actions': {

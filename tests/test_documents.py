@@ -100,7 +100,8 @@ def parameter_row(group: type, name: str, declaration: Declaration) -> list[str]
     default = 'required' if name in required(group) else str(getattr(group, name))
     kind = declaration.kind.__name__ + ('[]' if declaration.array else '')
     allowed = declaration.bound().removeprefix('must be ')
-    return [name, kind, declaration.unit or '-', default, allowed, declaration.text]
+    text = declaration.text + ('; **live**' if declaration.live else '')
+    return [name, kind, declaration.unit or '-', default, allowed, text]
 
 
 def parameter_rows(group: type) -> list[list[str]]:
@@ -326,7 +327,7 @@ def test_message_package_names_the_topics_that_are_published() -> None:
     nodes = [node for package in PACKAGES for node in node_files(package)]
     published = {
         (c.message.rpartition('/')[2], c.topic)
-        for node in [*nodes, NodeFile(reports)]
+        for node in [*nodes, NodeFile(reports), NodeFile(reports.with_name('loop_node.py'))]
         for c in node.connections()
         if c.direction == 'out' and c.message.startswith('fam_bundle_msgs/')
     }

@@ -16,6 +16,7 @@ from typing import Any
 from fam_bundle_bringup.graph import BRIDGE, COMPOSED, LOOP_LISTENERS, NODES
 from fam_bundle_bringup.processes import executable
 from fam_bundle_model.parameters import load_configuration
+from fam_bundle_node.network import CHOICES
 from fam_bundle_node.parent import VARIABLE
 import pytest
 import yaml
@@ -217,7 +218,7 @@ def exits(parts: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def bundle_of(parts: Any, name: str) -> Any:
     nodes = [Started(executable=node) for node in ('strain_controller', 'plant_simulator')]
-    return parts.Bundle(name, nodes, nodes[-1])
+    return parts.Bundle(name, nodes, nodes[-1], True)
 
 
 def reason(action: Any) -> str:
@@ -230,7 +231,7 @@ def test_the_end_of_the_plant_ends_the_launch_after_the_last_messages(
 ) -> None:
     bundle = bundle_of(parts, '')
     later = exits(bundle)(bundle.owner, 0)
-    assert later.options['period'] > 0.0
+    assert later.options['period'] > 3.0  # the middleware's heartbeat
     assert reason(later.options['actions'][0]) == 'the run is over'
 
 
@@ -250,20 +251,23 @@ def test_a_node_that_ends_too_early_ends_the_launch_with_its_name(
     assert said == f'{bundle.nodes[node].executable} ended with {status}'
 
 
-@pytest.mark.parametrize('chosen', [None, 'ROS_AUTOMATIC_DISCOVERY_RANGE', 'ROS_LOCALHOST_ONLY'])
+@pytest.mark.parametrize('chosen', [None, *CHOICES])
 def test_traffic_stays_here_unless_a_network_was_chosen(
     parts: Any, chosen: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in parts.NETWORK:
+    for name in CHOICES:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(parts, 'SetEnvironmentVariable', lambda *pair: pair)
+    monkeypatch.setattr(parts, 'UnsetEnvironmentVariable', lambda name: (name, None))
     monkeypatch.setattr(parts, 'LogInfo', lambda msg: msg)
+    monkeypatch.setenv('ROS_LOCALHOST_ONLY', '0')  # no choice
     if chosen:
         monkeypatch.setenv(chosen, 'SUBNET')
         assert parts.network() == [f'network as chosen: {chosen}=SUBNET']
     else:
         said, *kept = parts.network()
         assert 'loopback' in said
+        assert ('ROS_LOCALHOST_ONLY', None) in kept
         assert dict(kept)['FASTRTPS_DEFAULT_PROFILES_FILE'].endswith('fastdds_loopback.xml')
 
 

@@ -28,7 +28,7 @@ setup(
     packages=[package],
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package}']),
-        (f'share/{package}', ['package.xml']),
+        (f'share/{package}', ['LICENSE', 'package.xml']),
         (f'share/{package}/config', sorted(glob('config/*.yaml') + glob('config/*.xml'))),
         (f'share/{package}/launch', sorted(glob('launch/*.launch.py'))),
         (f'share/{package}/layouts', sorted(glob('layouts/*'))),

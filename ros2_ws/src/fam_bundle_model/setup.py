@@ -27,7 +27,7 @@ setup(
     package_data={package: ['py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package}']),
-        (f'share/{package}', ['package.xml']),
+        (f'share/{package}', ['LICENSE', 'package.xml']),
     ],
     install_requires=['setuptools'],
     extras_require={'test': ['pytest']},

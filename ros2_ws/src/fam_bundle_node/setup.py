@@ -26,7 +26,7 @@ setup(
     packages=[package],
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package}']),
-        (f'share/{package}', ['package.xml']),
+        (f'share/{package}', ['LICENSE', 'package.xml']),
     ],
     install_requires=['setuptools'],
     extras_require={'test': ['pytest']},

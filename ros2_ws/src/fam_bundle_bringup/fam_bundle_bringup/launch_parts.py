@@ -37,6 +37,7 @@ from fam_bundle_io.hardware.calibration import load_hardware
 from fam_bundle_model.doubts import doubts
 from fam_bundle_model.parameters import Configuration, PACES, SCHEMES, write_yaml
 from fam_bundle_model.schema import ConfigurationError
+from fam_bundle_node.network import chosen_network
 from fam_bundle_node.parent import VARIABLE
 from launch import LaunchContext, LaunchDescription
 from launch.actions import (
@@ -47,6 +48,7 @@ from launch.actions import (
     RegisterEventHandler,
     SetEnvironmentVariable,
     TimerAction,
+    UnsetEnvironmentVariable,
 )
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
@@ -57,14 +59,10 @@ import yaml
 AS_CONFIGURED = 'as_configured'
 LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 BOOLEANS = ('true', 'false')
-SETTLE = 1.0  # s after the end of a run in which the last messages reach a recorder
-# Any of these means that somebody has chosen a network.
-NETWORK = (
-    'FASTDDS_DEFAULT_PROFILES_FILE',
-    'FASTRTPS_DEFAULT_PROFILES_FILE',
-    'ROS_AUTOMATIC_DISCOVERY_RANGE',
-    *OVERRULE,
-)
+# After the end of a run the last messages may still be on their way to a recorder; one that was
+# lost is sent again with the middleware's next heartbeat, three seconds later.
+SETTLE, SETTLE_RECORDED = 0.1, 4.0  # s
+CLOSING = 20  # s that a recorder gets to write what it has
 
 
 class Argument(NamedTuple):
@@ -109,6 +107,7 @@ class Bundle(NamedTuple):
     name: str
     nodes: list[Node]
     owner: Node | None  # none: it runs until it is told to end
+    recorded: bool
 
 
 def describe(
@@ -147,15 +146,23 @@ def declare(name: str) -> DeclareLaunchArgument:
 
 def network() -> list[Any]:
     """Return the actions that keep traffic on this machine, unless a network was chosen."""
-    chosen = [f'{name}={os.environ[name]}' for name in NETWORK if os.environ.get(name)]
+    chosen = chosen_network(os.environ)
     if chosen:
         return [LogInfo(msg=f'network as chosen: {", ".join(chosen)}')]
+    # Not a choice, and set to 0 it would overrule the profile.
+    cleared = [UnsetEnvironmentVariable(name) for name in OVERRULE]
     kept = [SetEnvironmentVariable(name, value) for name, value in loopback().items()]
-    return [LogInfo(msg='network: the loopback of this machine (docs/networks.md)'), *kept]
+    return [
+        LogInfo(msg='network: the loopback of this machine (docs/networks.md)'),
+        *cleared,
+        *kept,
+    ]
 
 
 def start(bundles: Sequence[Bundle]) -> list[Any]:
     """Return the actions that start all nodes, and end all when the runs are over or one dies."""
+    recorded = any(bundle.recorded for bundle in bundles)
+    settle = SETTLE_RECORDED if recorded else SETTLE
     running = {bundle.name for bundle in bundles}
     actions: list[Any] = []
     for bundle in bundles:
@@ -169,7 +176,7 @@ def start(bundles: Sequence[Bundle]) -> list[Any]:
                 if running:
                     return None
                 over = shut_down('the run is over')
-                return TimerAction(period=SETTLE, actions=[over])
+                return TimerAction(period=settle, actions=[over])
 
             actions.append(RegisterEventHandler(OnProcessExit(target_action=node, on_exit=ended)))
         actions += bundle.nodes
@@ -191,6 +198,7 @@ def node(package: str, executable: str, values: Values, files: Sequence[Path]) -
         output='screen',
         ros_arguments=[*arguments, '--log-level', values['log_level']],
         additional_env={VARIABLE: str(os.getpid())},
+        sigterm_timeout=str(CLOSING),
     )
 
 
@@ -224,7 +232,7 @@ def bundle(values: Values, folder: Path, configuration: Configuration, **graph: 
     owner = nodes[-1]
     if record:
         nodes.insert(0, recorder(values, file))
-    return Bundle(name, nodes, owner)
+    return Bundle(name, nodes, owner, record)
 
 
 def recorder(values: Values, parameters: Path) -> Node:
@@ -290,4 +298,4 @@ def record(values: Values, folder: Path) -> list[Bundle]:
     configuration = configuration_of(values, {})
     file = folder / 'recorded.yaml'
     write_yaml(configuration, file)
-    return [Bundle('bag_recorder', [recorder(values, file)], None)]
+    return [Bundle('bag_recorder', [recorder(values, file)], None, True)]

@@ -21,6 +21,7 @@ import importlib
 import importlib.metadata
 import json
 import math
+import os
 from pathlib import Path
 import platform
 import resource
@@ -43,6 +44,7 @@ from fam_bundle_io.message_definitions import complete_definition
 from fam_bundle_model.parameters import Configuration, GROUPS, ProcessParameters, yaml_text
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.declare import declare_configuration
+from fam_bundle_node.network import chosen_network, NOT_CHOSEN
 from fam_bundle_node.parent import end_with_parent
 from fam_bundle_node.tuning import tune
 from rcl_interfaces.msg import ParameterDescriptor
@@ -468,6 +470,8 @@ def run(told: Callable[[], bool]) -> int:
         return 2
     log, folder = recorder.get_logger(), recorder.writer.folder
     log.info(f'recording to {folder}')
+    if not chosen_network(os.environ):
+        log.warning(NOT_CHOSEN)
     if recorder.configuration is not None:
         for warning in tune(below_the_loop(recorder.configuration.process), 'realtime'):
             log.warning(warning)

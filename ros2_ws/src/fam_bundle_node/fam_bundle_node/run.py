@@ -15,6 +15,7 @@
 """Runs nodes of the loop in this process until they are done: executor, tuning, exit status."""
 
 from collections.abc import Callable, Sequence
+import os
 import signal
 import sys
 import time
@@ -22,6 +23,7 @@ from types import FrameType
 
 from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_node.loop_node import LoopNode
+from fam_bundle_node.network import chosen_network, NOT_CHOSEN
 from fam_bundle_node.parent import end_with_parent
 from fam_bundle_node.tuning import tune
 import rclpy
@@ -78,6 +80,8 @@ def run_nodes(makers: Sequence[Callable[[], LoopNode]]) -> int:
             return INTERRUPTED
         print(' '.join(str(error).split()), file=sys.stderr)  # a file that is missing or no YAML
         return 2
+    if not chosen_network(os.environ):
+        nodes[0].get_logger().warning(NOT_CHOSEN)
     done = first_done(nodes)
     ends.raised = False  # in a callback, the executor would make a fatal error of it
     try:
