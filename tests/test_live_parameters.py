@@ -7,7 +7,7 @@ import time
 from typing import Any
 
 from fam_bundle_bringup import replay
-from fam_bundle_bringup.experiment import default_configuration
+from fam_bundle_bringup.experiment import bag_of, default_configuration
 from fam_bundle_bringup.graph import (
     close_bag,
     listening,
@@ -17,6 +17,7 @@ from fam_bundle_bringup.graph import (
     start_bag_recorder,
     start_nodes,
 )
+from fam_bundle_bringup.replay_changes import changes_of, Changing
 from fam_bundle_control.lag_table_server_node import LagTableServer
 from fam_bundle_control.pressure_controller_node import PressureController
 from fam_bundle_control.recruitment_supervisor_node import RecruitmentSupervisor
@@ -28,6 +29,7 @@ from fam_bundle_model.parameters import Configuration, write_yaml
 from fam_bundle_msgs.msg import BundleState
 from fam_bundle_node.qos import RECORDER_SUBSCRIPTION
 from fam_bundle_sim.plant_simulator_node import PlantSimulator
+import pandas as pd
 import pytest
 from rcl_interfaces.srv import SetParametersAtomically
 import rclpy
@@ -162,9 +164,43 @@ def test_a_run_with_changes_is_replayed_to_the_last_bit(
         while not group.finished(owner):
             listen(0.05)
         close_bag(recorder, tmp_path)
-    found = read_bag(tmp_path / 'bag').tables['/parameter_changes']
+    bag = read_bag(tmp_path / 'bag')
+    assert bag_of(tmp_path / 'bag')['missing'] == []
+    found = bag.tables['/parameter_changes']
     assert sorted(found['node']) == sorted(node for node, _ in changes)
     assert found['tick'].between(1, 11_998).all(), 'in mid-run'
     assert replay.run_replay(tmp_path / 'bag', None, None)
-    monkeypatch.setattr(replay, 'changes_of', lambda *_: ({}, []))
-    assert not replay.run_replay(tmp_path / 'bag', None, None)
+    whole = replay.changes_of
+    for node in {node for node, _ in changes}:
+
+        def without(*given: Any, node: str = node) -> Any:
+            known, notes = whole(*given)
+            return {name: found for name, found in known.items() if name != node}, notes
+
+        monkeypatch.setattr(replay, 'changes_of', without)
+        assert not replay.run_replay(tmp_path / 'bag', None, None), f'{node} made no difference'
+
+
+def test_changes_hold_in_the_order_in_which_they_were_made(
+    quick: Callable[..., Configuration],
+) -> None:
+    """Each is valid after those before it only, and two nodes do not mix."""
+    rows = [
+        ('recruitment_supervisor', 100, 'recruitment.downshift_threshold', 0.1),
+        ('strain_controller', 150, 'strain_loop.proportional_gain', 3e7),
+        ('recruitment_supervisor', 200, 'recruitment.upshift_threshold', 0.3),
+    ]
+    columns = ('published', 'node', 'tick', 'names[0]', 'values[0]')
+    table = pd.DataFrame([(1000, *row) for row in rows], columns=columns)
+    found, notes = changes_of(table, 0, quick())
+    assert len(notes) == len(rows)
+    at = Changing(quick(), found['recruitment_supervisor'])
+    thresholds = []
+    for tick in (99, 100, 199, 250):
+        at.at(tick)
+        given = at.now.recruitment
+        thresholds.append((given.downshift_threshold, given.upshift_threshold))
+    assert thresholds == [(0.4, 0.8), (0.1, 0.8), (0.1, 0.8), (0.1, 0.3)]
+    damaged = changes_of(table.assign(**{'values[0]': -1.0}), 0, quick())
+    assert damaged[0] == {}
+    assert 'damaged' in damaged[1][0]

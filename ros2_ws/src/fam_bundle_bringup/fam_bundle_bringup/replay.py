@@ -226,6 +226,8 @@ def replay_of(
     changed = bag.tables.get(f'{space}/{CHANGES}')
     changes, more = changes_of(changed, begun, configuration)
     notes += more
+    if f'{space}/{CHANGES}' not in bag.types:
+        notes.append(f'{CHANGES}: not in the bag; parameters set while it ran would not be known')
     run = Run(samples_of(table), answers, configuration.run.pace == 'realtime', laws, changes)
     for topic, found in answers.items():
         lacking = len(table.index.difference(found.index))

@@ -14,7 +14,6 @@
 
 """Parameters that were set while a recorded run went on."""
 
-from collections.abc import Mapping
 from typing import Any, TYPE_CHECKING
 
 from fam_bundle_model.parameters import Configuration, with_values
@@ -25,8 +24,8 @@ if TYPE_CHECKING:
 
 TOPIC = 'parameter_changes'
 NEEDED = {'published', 'tick', 'node', 'names', 'values'}
-# From which tick on, and by group.name.
-Change = tuple[int, Mapping[str, float]]
+# From which tick on, and the whole configuration of the node then.
+Change = tuple[int, Configuration]
 
 
 class Changing:
@@ -39,10 +38,10 @@ class Changing:
 
     def at(self, tick: int) -> bool:
         """Make ``now`` that of ``tick``, which is later than before; return whether it changed."""
-        due = [values for since, values in self._due if since <= tick]
+        due = [changed for since, changed in self._due if since <= tick]
         del self._due[: len(due)]
-        for values in due:
-            self.now = with_values(self.now, values)
+        if due:
+            self.now = due[-1]
         return bool(due)
 
 
@@ -58,15 +57,19 @@ def changes_of(
     found: dict[str, list[Change]] = {}
     if table is None:
         return found, []
+    notes = []
     try:
         for row in rows_of(table):
             tick = int(row['tick']) if row['published'] >= begun else 0
+            changes = found.setdefault(row['node'], [])
+            before = changes[-1][1] if changes else configuration
             values = dict(zip(row['names'], row['values'], strict=True))
-            with_values(configuration, values)
-            found.setdefault(row['node'], []).append((tick, values))
+            changes.append((tick, with_values(before, values)))
+            said = ', '.join(f'{name} = {value:g}' for name, value in values.items())
+            notes.append(f'{row["node"]}: {said} from tick {tick} on')
     except (ConfigurationError, ValueError, TypeError, KeyError) as error:
         return {}, [f'{TOPIC}: damaged ({error}); changed parameters are not replayed']
-    return found, []
+    return found, notes
 
 
 def rows_of(table: 'pd.DataFrame') -> list[dict[str, Any]]:

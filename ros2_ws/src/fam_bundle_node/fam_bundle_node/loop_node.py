@@ -269,7 +269,8 @@ class Controller(LoopNode):
         super().__init__(name, groups)
         self.stamps = StampClock(self.configuration.period_ns())
         self._ticks, self._tick_at = 0, 0.0
-        self._changes: Publisher | None = None  # made when one is needed
+        if self.LIVE:
+            self._changes = self.create_publisher(ParameterChange, 'parameter_changes', CHANGES)
 
     def restart(self) -> None:
         """Bring the law to its start, from which it sets in without a bump."""
@@ -284,8 +285,6 @@ class Controller(LoopNode):
         self.retune()
         names, values = list(self.changed), [float(value) for value in self.changed.values()]
         self.changed = {}
-        if self._changes is None:
-            self._changes = self.create_publisher(ParameterChange, 'parameter_changes', CHANGES)
         change = ParameterChange(tick=sample.tick, node=self.get_name(), names=names)
         change.header, change.values = sample.header, values
         self._changes.publish(change)
