@@ -14,7 +14,7 @@
 
 """What every card must do, whoever made it: the same sentences for each backend."""
 
-from conftest import PERIOD, SAFE_VOLTS
+from benches import PERIOD, SAFE_VOLTS
 import numpy as np
 import pytest
 

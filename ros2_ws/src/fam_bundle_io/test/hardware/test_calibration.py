@@ -17,7 +17,7 @@
 import dataclasses
 import re
 
-from conftest import CONFIG
+from benches import CONFIG
 from fam_bundle_io.hardware.calibration import (
     load_hardware,
     make_calibration,

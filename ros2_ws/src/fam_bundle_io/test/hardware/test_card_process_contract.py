@@ -21,7 +21,7 @@ import sys
 import tempfile
 import time
 
-from conftest import Bench, PERIOD
+from benches import Bench, PERIOD
 from fam_bundle_io.hardware.backend import load_backend
 from fam_bundle_sim.volts_card import read_log
 import numpy as np

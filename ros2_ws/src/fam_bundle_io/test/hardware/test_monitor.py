@@ -21,7 +21,7 @@ from pathlib import Path
 import re
 import tracemalloc
 
-from conftest import NOMINAL, PERIOD, SAFE_VOLTS
+from benches import NOMINAL, PERIOD, SAFE_VOLTS
 import fam_bundle_io.hardware
 from fam_bundle_io.hardware import backend as backend_module
 from fam_bundle_io.hardware.limits import Limits
@@ -435,7 +435,7 @@ def test_three_commands_that_cannot_be_are_a_fault(loop, bad):
 
 @pytest.fixture
 def card(hardware, configuration, monkeypatch):
-    from conftest import QuanserBench
+    from benches import QuanserBench
 
     return Loop(QuanserBench('quanser', hardware, configuration, monkeypatch))
 
@@ -555,7 +555,7 @@ def test_the_example_of_the_documents_runs(monkeypatch, capsys):
 
 def test_a_tick_leaves_nothing_behind(hardware, configuration):
     """In 3000 ticks our modules may not hold more, and no tick may need more than a little."""
-    from conftest import MockBench
+    from benches import MockBench
 
     loop = Loop(MockBench('mock', hardware, configuration)).run()
     monitor, spool = loop.monitor, COMMAND.copy()

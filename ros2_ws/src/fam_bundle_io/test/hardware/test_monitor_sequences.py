@@ -16,7 +16,7 @@
 
 import math
 
-from conftest import CONFIG, NOMINAL, PERIOD, RESTING_VOLTS, SAFE_VOLTS
+from benches import CONFIG, NOMINAL, PERIOD, RESTING_VOLTS, SAFE_VOLTS
 import fake_quanser
 from fam_bundle_io.hardware import backend as backend_module
 from fam_bundle_io.hardware.backend import make_setup

@@ -19,7 +19,7 @@ import itertools
 import math
 import re
 
-from conftest import NOMINAL, PERIOD
+from benches import NOMINAL, PERIOD
 from fam_bundle_io.hardware.calibration import MU_PRESSURE, Scaling, SOURCE_PRESSURE, STRAIN
 from fam_bundle_io.hardware.command_gate import CommandGate
 from fam_bundle_io.hardware.limits import Limits
@@ -507,7 +507,7 @@ def test_no_spool_moves_faster_than_its_limit_and_what_is_limited_says_so(spools
 
 
 def shipped():
-    from conftest import CONFIG
+    from benches import CONFIG
     from fam_bundle_io.hardware.calibration import load_hardware
 
     return load_hardware(CONFIG / 'volts_calibration.yaml')

@@ -18,7 +18,7 @@ import dataclasses
 import sys
 import types
 
-from conftest import NidaqmxBench, QuanserBench, RESTING_VOLTS
+from benches import NidaqmxBench, QuanserBench, RESTING_VOLTS
 import fake_nidaqmx
 import fake_quanser
 from fam_bundle_io.hardware import backend as module

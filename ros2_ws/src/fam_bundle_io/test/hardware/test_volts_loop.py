@@ -16,7 +16,7 @@
 
 import dataclasses
 
-from conftest import CONFIG
+from benches import CONFIG
 from fam_bundle_bringup.offline import run_offline
 from fam_bundle_control.pressure_loop import pressure_loop, pressure_loop_step
 from fam_bundle_control.recruitment import recruitment, recruitment_start, recruitment_step
