@@ -9,6 +9,7 @@ if [ -f "$workspace/setup.bash" ]; then
   # Who sets a profile of their own chooses another network.
   share="$workspace/fam_bundle_bringup/share/fam_bundle_bringup"
   export FASTRTPS_DEFAULT_PROFILES_FILE="${FASTRTPS_DEFAULT_PROFILES_FILE:-$share/config/fastdds_loopback.xml}"
+  export RMW_IMPLEMENTATION="${RMW_IMPLEMENTATION:-rmw_fastrtps_cpp}"
   export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-SYSTEM_DEFAULT}"
 fi
 export PYTHONPATH="${PYTHONPATH:+$PYTHONPATH:}/opt/extras"

@@ -23,7 +23,7 @@ import yaml
 
 FILES = Path(__file__).parents[1] / 'ros2_ws/src/fam_bundle_bringup/launch'
 TEMPLATE = FILES.parent / 'config' / 'volts_calibration.yaml'
-NAMES = ('hardware', 'mock', 'record', 'sim', 'two_bundles')
+NAMES = ('controllers', 'hardware', 'mock', 'record', 'sim', 'two_bundles')
 NEEDED = {'hardware': {'backend': 'quanser', 'hardware': str(TEMPLATE)}}
 RECORDER = ('fam_bundle_io', 'bag_recorder')
 
@@ -158,6 +158,12 @@ def test_mock_arms_a_card_that_moves_nothing_and_hardware_arms_none(launched: An
         bridges.append((configuration.bridge.backend, configuration.bridge.start))
     assert bridges == [('volts', 'armed'), ('quanser', 'unconfigured')]
     assert configuration.run.pace == 'realtime'
+
+
+def test_controllers_alone_have_no_owner(launched: Any) -> None:
+    (bundle,) = launched('controllers')
+    assert [(node.package, node.executable) for node in bundle.nodes] == list(NODES[:-1])
+    assert bundle.owner is None
 
 
 def test_a_recorder_alone_has_no_owner(launched: Any) -> None:

@@ -299,3 +299,11 @@ def record(values: Values, folder: Path) -> list[Bundle]:
     file = folder / 'recorded.yaml'
     write_yaml(configuration, file)
     return [Bundle('bag_recorder', [recorder(values, file)], None, True)]
+
+
+def controllers(values: Values, folder: Path) -> list[Bundle]:
+    """Return the controllers of a bundle whose plant or bridge runs elsewhere."""
+    file = folder / 'controllers.yaml'
+    write_yaml(configuration_of(values, {}), file)
+    nodes = [node(package, name, values, [file]) for package, name in nodes_of()[:-1]]
+    return [Bundle('controllers', nodes, None, False)]
