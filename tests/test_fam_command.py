@@ -26,7 +26,10 @@ TOOLS = {
 }
 PROFILE = 'ros2_ws/src/fam_bundle_bringup/config/fastdds_loopback.xml'
 LOCKS = sorted((REPOSITORY / 'requirements').glob('*.txt'))
-NPM = 'tests/readers/package.json', 'tests/readers/package-lock.json'
+NPM = ('tests/readers', 'docs/site')  # what npm installs into
+NPM_FILES = [
+    f'{folder}/{name}' for folder in NPM for name in ('package.json', 'package-lock.json')
+]
 
 
 def executable(path, script):
@@ -49,7 +52,7 @@ class Tree:
             'fam',
             'cmake/wheel_include_dirs.cmake',
             PROFILE,
-            *NPM,
+            *NPM_FILES,
             *(f'requirements/{p.name}' for p in LOCKS),
         ):
             target = self.root / name
@@ -91,7 +94,7 @@ class Tree:
 
     def due(self):
         module = self.module()
-        return [step.title for step in module.plan(False, False) if module.is_due(step)]
+        return [step.title for step in module.plan(False) if module.is_due(step)]
 
     def pretend_set_up(self):
         """Write what a finished set-up leaves: stamps, environment, one executable."""
@@ -106,7 +109,7 @@ class Tree:
         self.stamp()
 
     def stamp(self):
-        for step in self.module().plan(False, True):
+        for step in self.module().plan(False, testing=True, site=True):
             step.stamp.parent.mkdir(parents=True, exist_ok=True)
             step.stamp.write_text(step.digest)
 
@@ -265,24 +268,38 @@ def test_a_vanished_interpreter_makes_the_packages_due(tree):
     assert tree.due() == ['Python packages']
 
 
-def test_the_readers_of_npm_are_installed_once_where_npm_is_and_only_for_tests(tree):
+@pytest.mark.parametrize('folder', NPM)
+def test_what_npm_has_is_installed_once_where_npm_is_and_only_for_tests(tree, folder):
     tree.pretend_set_up()
-    note, modules = tree.root / 'asked', tree.root / 'tests/readers/node_modules'
+    note, modules = tree.root / 'asked', tree.root / folder / 'node_modules'
     shutil.rmtree(modules, ignore_errors=True)
-    # As `npm ci` does it: what was there before is gone.
-    npm = f'echo "$@" >> {note}; /bin/rm -rf {modules}; /bin/mkdir {modules}'
+    # As `npm ci --prefix FOLDER` does it: what was there before is gone.
+    npm = f'echo "$@" >> {note}; m=$3/node_modules; /bin/rm -rf $m; /bin/mkdir $m'
+    asked = f'ci --prefix {tree.root / folder} '
     assert tree.fam('test')[0] == 0
     assert not modules.exists()
-    executable(tree.path / 'npm', f'{npm}; echo > {modules}/.package-lock.json')
+    executable(tree.path / 'npm', f'{npm}; echo > $m/.package-lock.json')
     assert tree.fam('setup')[0] == 0
     assert not note.exists()
     for _ in range(2):
         assert tree.fam('test')[0] == 0
-    assert len(note.read_text().splitlines()) == 1
-    assert note.read_text().startswith(f'ci --prefix {tree.root / "tests/readers"} ')
-    (tree.root / NPM[1]).write_text('{}')
+    assert note.read_text().count(asked) == 1
+    (tree.root / folder / 'package-lock.json').write_text('{}')
     assert tree.fam('test')[0] == 0
-    assert len(note.read_text().splitlines()) == 2
+    assert note.read_text().count(asked) == 2
+
+
+def test_the_site_is_built_strictly_and_needs_npm(tree):
+    tree.pretend_set_up()
+    status, _, err = tree.fam('docs')
+    assert status == 2
+    assert_one_line(err, 'npm is missing')
+    executable(
+        tree.path / 'npm', 'd=$3/node_modules; /bin/mkdir -p $d; echo > $d/.package-lock.json'
+    )
+    status, out, _ = tree.fam('docs', '--site-dir', 'elsewhere')
+    built = f'python -m mkdocs build --strict --config-file {tree.root / "mkdocs.yml"}'
+    assert (status, out) == (0, f'{built} --site-dir elsewhere\n')
 
 
 def test_a_step_that_fails_shows_the_end_of_its_log(tree):
@@ -408,11 +425,12 @@ def test_a_lock_pins_with_hashes_and_holds_no_address(lock):
             assert '--hash=sha256:' in block
 
 
-def test_the_lock_of_npm_pins_with_hashes_and_holds_no_address():
-    text = (REPOSITORY / NPM[1]).read_text()
+@pytest.mark.parametrize('folder', NPM)
+def test_a_lock_of_npm_pins_with_hashes_and_holds_no_address(folder):
+    text = (REPOSITORY / folder / 'package-lock.json').read_text()
     assert '://' not in text
     packages = json.loads(text)['packages']
-    wanted = json.loads((REPOSITORY / NPM[0]).read_text())['dependencies']
+    wanted = json.loads((REPOSITORY / folder / 'package.json').read_text())['dependencies']
     assert packages.pop('')['dependencies'] == wanted
     assert {f'node_modules/{name}' for name in wanted} < set(packages)
     for package in packages.values():

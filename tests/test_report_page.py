@@ -2,11 +2,11 @@
 """The page of a report, in a real browser without network."""
 
 from collections.abc import Iterator
-import json
 from pathlib import Path
 import shutil
 from typing import Any
 
+from browser import headless, problems, requested
 from fam_bundle_io.metrics import Window
 from fam_bundle_io.report_files import write_report
 import numpy as np
@@ -23,38 +23,7 @@ def report(recorded_runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.fixture(scope='module')
 def browser() -> Iterator[Any]:
-    """Give a headless Chromium that resolves no host name."""
-    webdriver = pytest.importorskip('selenium.webdriver')
-    chromium = shutil.which('chromium') or shutil.which('chromium-browser')
-    driver = shutil.which('chromedriver')
-    if not (chromium and driver):
-        pytest.skip('needs chromium and chromedriver: apt install chromium chromium-driver')
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    for argument in (
-        '--headless=new',
-        '--no-sandbox',
-        '--disable-gpu',
-        '--disable-dev-shm-usage',
-        '--window-size=1250,1000',
-        '--host-resolver-rules=MAP * ~NOTFOUND',
-    ):
-        options.add_argument(argument)
-    options.set_capability('goog:loggingPrefs', {'browser': 'ALL', 'performance': 'ALL'})
-    service = webdriver.ChromeService(executable_path=driver)
-    found = webdriver.Chrome(options=options, service=service)
-    yield found
-    found.quit()
-
-
-def requested(browser: Any) -> set[str]:
-    """Return the addresses that the page asked for."""
-    found = set()
-    for entry in browser.get_log('performance'):
-        message = json.loads(entry['message'])['message']
-        if message['method'] == 'Network.requestWillBeSent':
-            found.add(message['params']['request']['url'])
-    return found
+    yield from headless()
 
 
 def ranges(browser: Any, plot: Any) -> list[list[float]]:
@@ -69,11 +38,11 @@ def test_the_page_works_in_a_browser_without_network(browser: Any, report: Path)
     from selenium.webdriver.common.action_chains import ActionChains
     from selenium.webdriver.common.by import By
 
-    browser.get_log('performance')
+    requested(browser)
     page = (report / 'report.html').resolve().as_uri()
     browser.get(page)
     assert {a for a in requested(browser) if not a.startswith('data:')} == {page}
-    assert [entry for entry in browser.get_log('browser') if entry['level'] == 'SEVERE'] == []
+    assert problems(browser) == []
     plots = browser.find_elements(By.CSS_SELECTOR, '.js-plotly-plot')
     assert len(plots) == 7  # comparison, energy, by state, two runs, two latencies
     for plot in plots:
