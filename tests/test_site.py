@@ -26,6 +26,7 @@ CSS_ADDRESS = re.compile(r'url\(\s*["\']?([^"\')]+)|@import\s+["\']([^"\']+)')
 @pytest.fixture(scope='session')
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build the site as ``./fam docs`` does, strictly: a warning fails it."""
+    pytest.importorskip('mkdocs')
     if not (ROOT / 'docs' / 'site' / 'node_modules').is_dir():
         pytest.skip('the scripts of the site are missing: install npm, then ./fam test')
     folder = tmp_path_factory.mktemp('site')
