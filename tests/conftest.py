@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 import functools
 import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 from typing import Any
@@ -12,6 +13,10 @@ from typing import Any
 from fam_bundle_bringup.experiment import default_configuration, run_experiment
 from fam_bundle_model.parameters import Configuration, load_configuration
 import pytest
+
+# What a shell runs in the background has SIGINT ignored, and all that a test starts would too.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # One quick cycle in which every scheme shifts up and down.
 QUICK = {'amplitude': 0.06, 'frequency': 0.25, 'cycles': 1}

@@ -134,7 +134,7 @@ def run_faults(
     Try every fault whose name contains ``only``; write ``faults.json``, print the table.
 
     ``bridge`` asks for those of the hardware bridge, on the simulated rig in volts. Returns
-    whether all passed.
+    whether all passed. Raises ConfigurationError where ``only`` is in no name.
     """
     reference = dataclasses.replace(configuration.reference, cycles=LONG)
     run = dataclasses.replace(configuration.run, pace='realtime')

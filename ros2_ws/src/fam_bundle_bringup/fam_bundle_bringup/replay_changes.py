@@ -73,7 +73,11 @@ def changes_of(
 
 
 def rows_of(table: 'pd.DataFrame') -> list[dict[str, Any]]:
-    """Return the messages in a table, whether or not their arrays are columns of their own."""
+    """
+    Return the messages in a table, whether or not their arrays are columns of their own.
+
+    Raises KeyError where one lacks a field.
+    """
     rows = []
     for row in table.to_dict('records'):
         arrays: dict[str, dict[int, Any]] = {'names': {}, 'values': {}}

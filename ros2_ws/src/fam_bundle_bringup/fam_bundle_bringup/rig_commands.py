@@ -229,7 +229,11 @@ def _calibration_line(rig: Rig) -> str:
 
 
 def run_check(options: argparse.Namespace) -> int:
-    """Check every motor unit; status 1 unless each is answered by its own transducer."""
+    """
+    Check every motor unit; status 1 unless each is answered by its own transducer.
+
+    Raises ConfigurationError where valves were not told to move, or the rig cannot be used.
+    """
     limit = 1e3 * options.pressure
     rig = rig_of(options, SIMULATED_SHARE * limit)
     if not rig.simulated:
@@ -271,7 +275,11 @@ def check_rig(rig: Rig, backend: str, limit: float) -> list[Finding]:
 
 
 def run_zero(options: argparse.Namespace) -> int:
-    """Zero a vented rig into a new file."""
+    """
+    Zero a vented rig into a new file.
+
+    Raises ConfigurationError where the file exists or cannot be, or the rig cannot be used.
+    """
     out = options.out
     if out.exists():
         raise ConfigurationError(f'--out {out}: exists already: name another file')

@@ -66,7 +66,8 @@ def first_bump(rig: Rig, tick: int) -> float:
 
     That is the pressure of its sample or of the last one answered before, at which the law was
     kept until then: a unit that is being vented loses some percent in a millisecond. The law's
-    proportional action on what the strain has moved since is no bump.
+    proportional action on what the strain has moved since is no bump. Raises RuntimeError
+    where no reference has come.
     """
     commands = (s.message for s in rig.seen['valve_command'])
     references = {command.tick: command.pressure_reference[0] for command in commands}

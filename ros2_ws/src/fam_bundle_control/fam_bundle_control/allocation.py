@@ -129,7 +129,7 @@ def allocate(
     Fill ``references`` (units,), the pressure in Pa that each unit shall have; vented ones 0.
 
     ``batch``: the pressure reference, for the units before the newest with the compensation
-    (equation 11) on top, none above the source pressure.
+    (equation 10) on top, none above the source pressure.
 
     ``force``: one pressure for all recruited units at which the bundle, with the vented units as
     measured, has the force demanded. While units fill or a released one drains, those that are

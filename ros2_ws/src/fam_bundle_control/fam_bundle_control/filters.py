@@ -30,7 +30,7 @@ class Cascade(NamedTuple):
 
 @compiled
 def filtered(previous: float, value: float, time_constant: float, dt: float) -> float:
-    """Return the next output of a first-order low-pass filter (backward Euler)."""
+    """Return the next output of a first-order low-pass filter (backward Euler); times in s."""
     return previous + (value - previous) * dt / (time_constant + dt)
 
 

@@ -45,7 +45,7 @@ def forecasts_start(columns: int) -> Forecasts:
 
 @compiled
 def forecasts_step(state: Forecasts, horizon: float, dt: float) -> Forecasts:
-    """Return the ring at the next tick: rows older than what is due now are given up."""
+    """Return the ring ``dt`` s later: rows older than what is due now are given up."""
     clock = state.clock + dt
     oldest = state.oldest
     while oldest < state.newest and state.rows[(oldest + 1) % ROWS, 0] <= clock - horizon:

@@ -120,7 +120,7 @@ class Course(NamedTuple):
     position: float
     velocity: float
     acceleration: float
-    frequency: float
+    angular_frequency: float
     weight: float
 
 
@@ -255,7 +255,7 @@ def course_of(law: Predictor, state: PredictorState, reference: Reference) -> Co
         state.position,
         state.velocity,
         state.acceleration,
-        state.sinusoid.frequency,
+        state.sinusoid.angular_frequency,
         state.weight,
     )
 
@@ -285,7 +285,9 @@ def modelled(course: Course, then: float, ahead: float) -> float:
         left = course.reference - course.position
         return course.position + then - course.reference + caught_up * left
     if course.kind == SINUSOID:
-        rise = sinusoid_ahead(course.velocity, course.acceleration, course.frequency, ahead)
+        rise = sinusoid_ahead(
+            course.velocity, course.acceleration, course.angular_frequency, ahead
+        )
         return course.position + rise
     lasts = min(ahead, REACH)
     bend = course.acceleration * lasts * (ahead - 0.5 * lasts)

@@ -43,7 +43,7 @@ class Sinusoid(NamedTuple):
     What is known of it: filters, least squares, and now its derivatives and frequency.
 
     ``velocity`` (1/s) and ``acceleration`` (1/s^2) are those of the strain at the last tick,
-    ``frequency`` is in rad/s.
+    ``angular_frequency`` is in rad/s.
     """
 
     filters: Cascade
@@ -51,12 +51,12 @@ class Sinusoid(NamedTuple):
     variance: float
     velocity: float
     acceleration: float
-    frequency: float
+    angular_frequency: float
 
 
 @compiled
 def sinusoid_start(strain: float) -> Sinusoid:
-    """Return what is known at the first tick: standing still."""
+    """Return what is known at the first tick: standing still at ``strain`` (dimensionless)."""
     return Sinusoid(resting_cascade(strain), 0.0, 0.0, 0.0, 0.0, SLOWEST)
 
 
@@ -65,7 +65,7 @@ def sinusoid_step(state: Sinusoid, strain: float, dt: float) -> Sinusoid:
     """Return what is known after one tick's measured strain; ``dt`` in s."""
     filters = cascade_step(state.filters, strain, TIME_CONSTANT, dt)
     one, two, three = cascade_derivatives(filters, TIME_CONSTANT)
-    share = dt / (min(MEMORY, SPAN / state.frequency) + dt)
+    share = dt / (min(MEMORY, SPAN / state.angular_frequency) + dt)
     covariance = state.covariance + (one * three - state.covariance) * share
     variance = state.variance + (one * one - state.variance) * share
     square = -covariance / variance if variance > 0.0 else 0.0
@@ -81,9 +81,11 @@ def sinusoid_step(state: Sinusoid, strain: float, dt: float) -> Sinusoid:
 
 
 @compiled
-def sinusoid_ahead(velocity: float, acceleration: float, frequency: float, ahead: float) -> float:
+def sinusoid_ahead(
+    velocity: float, acceleration: float, angular_frequency: float, ahead: float
+) -> float:
     """Return how much a sinusoid will have risen ``ahead`` s from now."""
-    angle = frequency * ahead
+    angle = angular_frequency * ahead
     half = math.sin(0.5 * angle)
-    bend = 2.0 * acceleration * half * half / (frequency * frequency)
-    return velocity * math.sin(angle) / frequency + bend
+    bend = 2.0 * acceleration * half * half / (angular_frequency * angular_frequency)
+    return velocity * math.sin(angle) / angular_frequency + bend

@@ -90,7 +90,7 @@ def turning(velocity, acceleration, frequency, position=0.05):
     """Return the state of a sinusoid that is trusted fully; SI units, rad/s."""
     start = predictor_start()
     known = start.sinusoid._replace(
-        velocity=velocity, acceleration=acceleration, frequency=frequency
+        velocity=velocity, acceleration=acceleration, angular_frequency=frequency
     )
     return start._replace(
         strain=position,
@@ -155,11 +155,11 @@ def test_the_sinusoid_is_found_within_a_cycle_and_a_quarter(frequency, phase):
     strains = offset + amplitude * np.sin(w * time + phase)
     state, _, errors = after(SINUSOID, strains)
     found = state.sinusoid
-    rise = -found.acceleration / found.frequency**2
-    assert found.frequency == pytest.approx(w, rel=0.02)
+    rise = -found.acceleration / found.angular_frequency**2
+    assert found.angular_frequency == pytest.approx(w, rel=0.02)
     assert state.position - rise == pytest.approx(offset, abs=0.02 * amplitude)
     assert math.hypot(rise, found.velocity / w) == pytest.approx(amplitude, rel=0.02)
-    angle = math.atan2(rise, found.velocity / found.frequency)
+    angle = math.atan2(rise, found.velocity / found.angular_frequency)
     apart = (angle - w * time[-1] - phase + math.pi) % (2.0 * math.pi) - math.pi
     assert apart == pytest.approx(0.0, abs=0.02)
     _, _, by_rate = after(CONSTANT_RATE, strains)
@@ -171,7 +171,9 @@ def test_the_frequency_converges_to_the_true_one():
     for frequency in (0.05, 0.2, 0.45):
         strains = 0.06 * (1.0 - np.cos(2.0 * math.pi * frequency * np.arange(60000) * DT))
         state, _, errors = after(SINUSOID, strains)
-        assert state.sinusoid.frequency == pytest.approx(2.0 * math.pi * frequency, rel=1e-3)
+        assert state.sinusoid.angular_frequency == pytest.approx(
+            2.0 * math.pi * frequency, rel=1e-3
+        )
         assert state.weight > 0.99
         _, _, by_rate = after(CONSTANT_RATE, strains)
         assert rms(errors[-5000:]) < 0.01 * rms(by_rate[-5000:])
@@ -295,7 +297,7 @@ def test_the_first_crossing_is_that_of_an_independent_root_finder(state, target,
     found = reach(law, state, STILL, target)
 
     def above(ahead):
-        w, s = state.sinusoid.frequency, state.sinusoid
+        w, s = state.sinusoid.angular_frequency, state.sinusoid
         strain = state.position + s.velocity * math.sin(w * ahead) / w
         strain += s.acceleration * (1.0 - math.cos(w * ahead)) / w**2
         return sign * (strain - target)
@@ -328,7 +330,7 @@ def test_a_higher_target_is_reached_no_sooner(state, target, more):
 @given(SINUSOIDS, st.floats(-0.02, 0.12))
 def test_a_strain_mirrored_falls_when_it_rose(state, target):
     s = state.sinusoid
-    mirrored = turning(-s.velocity, -s.acceleration, s.frequency, -state.position)
+    mirrored = turning(-s.velocity, -s.acceleration, s.angular_frequency, -state.position)
     law = law_of(SINUSOID)
     fall = time_to_fall(law, mirrored, STILL, -target)
     assert time_to_rise(law, state, STILL, target) == fall

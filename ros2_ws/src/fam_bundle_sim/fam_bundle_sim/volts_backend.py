@@ -137,7 +137,11 @@ class VoltsBackend:
         self.armed, self._unwatched = True, 0
 
     def read(self, volts: Array) -> None:
-        """Let a period pass, and fill ``volts`` (inputs,) with what the card then sees."""
+        """
+        Let a period pass, and fill ``volts`` (inputs,) with what the card then sees.
+
+        Raises OSError where the card has been told to fail, or is not ready.
+        """
         self._ready('read', usable=False)
         check_volts('read', volts, len(self.volts))
         self._pass_period()

@@ -186,7 +186,11 @@ class NidaqmxBackend(Card):
 
 
 def import_vendor() -> Any:
-    """Return the vendor's package with all modules of it that are used."""
+    """
+    Return the vendor's package with all modules of it that are used.
+
+    Raises BackendError where it is not installed.
+    """
     try:
         for module in MODULES:
             importlib.import_module(f'nidaqmx.{module}')

@@ -125,7 +125,11 @@ class QuanserBackend(Card):
 
 
 def import_vendor() -> tuple[Any, Any]:
-    """Return the vendor's module and its overflow modes, which it does not re-export."""
+    """
+    Return the vendor's module and its overflow modes, which it does not re-export.
+
+    Raises BackendError where it is not installed.
+    """
     try:
         hardware: Any = importlib.import_module('quanser.hardware')
         enumerations: Any = importlib.import_module('quanser.hardware.enumerations')
