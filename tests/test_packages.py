@@ -6,12 +6,16 @@ from collections.abc import Iterator
 import importlib
 from importlib.metadata import distribution
 from pathlib import Path
+import re
+import shlex
 import subprocess
 import sys
+from xml.etree import ElementTree
 
 from catkin_pkg.changelog import get_changelog_from_path
 from catkin_pkg.package import Package, parse_package
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / 'ros2_ws' / 'src'
@@ -59,6 +63,13 @@ def keys_of(modules: set[str], name: str) -> set[str]:
     ours = {path.stem for path in (SOURCE / name / 'test').rglob('*.py')} | {name}
     foreign = modules - set(sys.stdlib_module_names) - ours
     return {KEYS.get(module, module) for module in foreign - OPTIONAL.get(name, set())}
+
+
+@pytest.mark.parametrize('name', PACKAGES)
+def test_no_dependency_stands_twice(name: str) -> None:
+    tree = ElementTree.parse(SOURCE / name / 'package.xml')
+    found = [(item.tag, item.text) for item in tree.getroot() if item.tag.endswith('depend')]
+    assert len(found) == len(set(found))
 
 
 @pytest.mark.parametrize('name', PYTHON)
@@ -140,6 +151,38 @@ def test_the_rules_of_aments_linters_hold_where_they_are_installed(linter: str) 
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_class_and_its_first_method_stand_apart() -> None:
+    # ament_flake8's CNL100, the one of its rules that neither ruff nor its formatter knows.
+    joined = re.compile(r'^ *class [^\n]*:\n *(def|@|async)\b', re.MULTILINE)
+    assert joined.search('class X:\n    def f(self): ...')
+    for path in SOURCE.glob('*/*/**/*.py'):
+        assert not joined.search(path.read_text()), path
+
+
+HOOKS = yaml.safe_load((ROOT / '.pre-commit-config.yaml').read_text())['repos'][0]['hooks']
+GOOD = {
+    'python': '"""One number."""\n\na = 1\n',
+    'xml': '<a><b/></a>',
+    'yaml': 'a: !!python/name:b.c\n---\n- 1\n',
+}
+BAD = {'python': "a = 'a\n", 'xml': '<a><b></a>', 'yaml': 'a: [1\n'}
+
+
+@pytest.mark.parametrize('hook', HOOKS, ids=lambda hook: hook['id'])
+@pytest.mark.skipif(not (ROOT / '.venv').exists(), reason='hooks use what ./fam test installs')
+def test_what_runs_before_a_commit_is_installed_and_notices(hook: dict, tmp_path: Path) -> None:
+    (kind,) = hook['types']
+    statuses = []
+    for text in (GOOD[kind], BAD[kind]):
+        (tmp_path / 'file').with_suffix('.py' if kind == 'python' else '').write_text(text)
+        file = next(tmp_path.iterdir())
+        words = [*shlex.split(hook['entry']), str(file)]
+        done = subprocess.run(words, cwd=ROOT, capture_output=True, check=False)
+        statuses.append(done.returncode)
+    assert statuses[0] == 0
+    assert statuses[1] != 0
 
 
 def test_every_file_of_a_package_begins_with_the_licence() -> None:

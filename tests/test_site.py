@@ -83,7 +83,7 @@ def is_outside(address: str) -> bool:
 
 
 def test_every_document_has_a_page(site: Path) -> None:
-    readmes = [path for path in (*SOURCE.glob('*/README.md'), ROOT / 'README.md')]
+    readmes = (*SOURCE.glob('*/README.md'), ROOT / 'README.md')
     for path in (*readmes, *ROOT.glob('docs/*.md'), *ROOT.glob('studies/**/*.md')):
         page = site / path.relative_to(ROOT).with_suffix('.html')
         page = page.with_name('index.html') if path.name == 'README.md' else page

@@ -86,7 +86,7 @@ def test_quanser_is_initialised_in_the_order_of_the_vendors_own_code(quanser):
 
 def test_quanser_gets_its_channels_ranges_and_expiration_states(quanser):
     quanser.backend.configure(quanser.setup)
-    assert quanser.board.input_range == {channel: (-10.0, 10.0) for channel in range(6)}
+    assert quanser.board.input_range == dict.fromkeys(range(6), (-10.0, 10.0))
     assert quanser.board.output_range == {0: (-10.0, 10.0), 3: (-10.0, 10.0)}
     assert quanser.board.expiration == {0: 0.25 - 9.375, 3: 9.375}
 
