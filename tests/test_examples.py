@@ -2,6 +2,7 @@
 """The examples that the documents show work as they stand there."""
 
 from collections.abc import Iterator
+import dataclasses
 import os
 from pathlib import Path
 import shutil
@@ -25,6 +26,7 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / 'examples'
 SOURCE = ROOT / 'ros2_ws' / 'src'
 CONFIG = SOURCE / 'fam_bundle_bringup' / 'config'
+PATIENCE = 60.0  # s; only a hang takes that long
 
 
 def apply(patch: str, folder: Path) -> None:
@@ -164,7 +166,9 @@ def card() -> Iterator[tuple[Microcontroller, int]]:
 def setup_of(**options: Any) -> Setup:
     hardware = load_hardware(CONFIG / 'volts_calibration.yaml')
     hardware.options['line_card'] = options
-    return make_setup(hardware, 'line_card', period=0.001)
+    # Patient: the card of the test is a thread among others on a machine that may be busy.
+    setup = make_setup(hardware, 'line_card', period=0.001)
+    return dataclasses.replace(setup, read_timeout=PATIENCE)
 
 
 @pytest.mark.usefixtures('installed')
