@@ -279,10 +279,11 @@ def check_known(printed: Printed) -> None:
 
 
 KNOWN = (
-    r'cd fam_bundle(/ros2_ws)?',
+    r'cd (fam_bundle(/ros2_ws)?|ros2_ws)',
     r'source (/opt/ros/jazzy|install)/setup.bash',
     r'rosdep install --from-paths src -i -y',
     r'colcon build --cmake-args -DCMAKE_BUILD_TYPE=Release',
+    r'colcon test(-result)?',
     r'pre-commit install',
     r'dask scheduler --host 127\.0\.0\.1 --no-dashboard',
     r'dask worker tcp://127\.0\.0\.1:8786 --nthreads 1 --nworkers 2 --no-dashboard',
