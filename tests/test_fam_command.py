@@ -149,6 +149,16 @@ def test_help_lists_every_command(tree, arguments):
         assert re.search(rf'^  {command}  +\S', out, re.MULTILINE)
 
 
+def test_the_readme_names_every_command(tree):
+    text, module = (REPOSITORY / 'README.md').read_text(), tree.module()
+    missing = [
+        command
+        for command in (*module.PASSED_ON, *module.OWN)
+        if not re.search(rf'\./fam {command}\b', text)
+    ]
+    assert missing == []
+
+
 def test_an_unknown_command_is_refused_in_one_line(tree):
     status, out, err = tree.fam('dmeo')
     assert (status, out) == (2, '')

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import importlib.util
 import os
 from pathlib import Path
+import re
 import runpy
 import signal
 import subprocess
@@ -83,6 +84,11 @@ def test_these_are_all_the_files(parts: Any) -> None:
     assert sorted(path.name for path in FILES.iterdir()) == [f'{n}.launch.py' for n in NAMES]
     used = {argument for name in NAMES for argument in arguments_of(name)}
     assert used == set(parts.ARGUMENTS)
+
+
+def test_the_table_of_files_in_the_readme_is_whole() -> None:
+    text = (FILES.parent / 'README.md').read_text()
+    assert sorted(re.findall(r'^\| `(\w+)\.launch\.py` \|', text, re.MULTILINE)) == list(NAMES)
 
 
 def test_every_argument_says_what_it_is_for_and_its_default_is_a_choice(parts: Any) -> None:

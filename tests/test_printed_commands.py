@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each command that a document prints: its program, options, files, names and values exist."""
 
+import ast
 from collections.abc import Callable, Iterator
 from importlib.machinery import SourceFileLoader
 import importlib.util
@@ -14,7 +15,7 @@ from fam_bundle_bringup.cli import parser
 from fam_bundle_bringup.doctor import add_doctor_options
 from fam_bundle_bringup.graph import BRIDGE, NODES
 from fam_bundle_bringup.one_line_parser import Parser
-from fam_bundle_model.parameters import GROUPS
+from fam_bundle_model.parameters import GROUPS, PACES, SCHEMES
 from fam_bundle_model.schema import ConfigurationError, declarations
 from fam_bundle_node.network import CHOICES
 import pytest
@@ -22,13 +23,22 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 LAUNCH = ROOT / 'ros2_ws/src/fam_bundle_bringup/launch'
-BLOCK = re.compile(r'^```(\S*).*?\n(.*?)^```', re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r'^ *```(\S*).*?\n(.*?)^ *```', re.MULTILINE | re.DOTALL)
+# Graphs of text, and what commands print: how these begin.
+PICTURE = re.compile(r'bundle_state$|unconfigured ─|fam experiment: |domain \d+, |plant +─')
 SHELLS = ('', 'bash', 'console', 'sh')
 # What stands for something of the reader's own.
 THEIRS = ('mine.csv', 'other.yaml', 'rig.yaml', 'rig_config.yaml', 'rig_zeroed.yaml')
 STANDS_FOR = ('ADDRESS', 'FILE', 'NAME', '/absolute/rig.yaml', '/path/to/copy.xml')
 EXECUTABLES = {name: package for package, name in (*NODES, BRIDGE)}
 SERVICES = ('arm', 'disarm', 'emergency_stop', 'reset_fault', 'zero')
+# Of the launch arguments that are printed; tests/test_launch.py tries every choice.
+LAUNCH_CHOICES = {
+    'scheme': SCHEMES,
+    'pace': PACES,
+    'record': ('true', 'false'),
+    'composed': ('true', 'false'),
+}
 TRANSITIONS = ('configure', 'activate', 'deactivate', 'cleanup', 'shutdown')
 VARIABLES = (*CHOICES, 'RMW_IMPLEMENTATION', 'P')
 OWN_PARAMETERS = ('bag.folder', 'bag.topics', 'bag.split_size', 'bag.split_duration')
@@ -47,10 +57,10 @@ def commands() -> Iterator[tuple[Path, list[str], str]]:
         before: list[str] = []
         blocks = BLOCK.findall(path.read_text())
         for block in (text for language, text in blocks if language in SHELLS):
-            lines = [line.strip() for line in block.splitlines()]
+            lines = [line.strip() for line in block.replace('\\\n', ' ').splitlines()]
             lines = [line for line in lines if line and not line.startswith('#')]
-            if not lines or program(lines[0]) not in CHECKS:
-                continue  # a picture, or what a command prints
+            if not lines or PICTURE.match(lines[0]):
+                continue
             for line in lines:
                 yield path, list(before), line
                 before.append(line)
@@ -72,14 +82,18 @@ class Printed:
         """Assert that a file exists, is the reader's, or is made by a command before."""
         if name in STANDS_FOR or Path(name).name in THEIRS or name.startswith('$'):
             return
-        made = any(folder_of(line, name) for line in self.before) or name.startswith('runs/demo/')
+        made = any(folder_of(line, name) for line in self.before)
         assert made or (ROOT / name).exists(), f'{name}: not there, and nothing before makes it'
 
 
 def folder_of(line: str, name: str) -> bool:
     """Return whether a command makes the folder that ``name`` is in."""
     words = shlex.split(line, comments=True)
+    if words[0] == 'cp':
+        return name == words[2]
     out = words[words.index('--out') + 1] if '--out' in words else None
+    if words[:2] == ['./fam', 'demo']:
+        out = 'runs/demo'
     return bool(out) and (name == out or name.startswith(f'{out}/'))
 
 
@@ -102,7 +116,7 @@ def check_fam(printed: Printed) -> None:
         if command == 'run':
             check_run(printed, rest)
         elif command == 'test':
-            assert set(rest[::2]) <= {'-q', '-k'} or rest == ['-q', '-k', 'lag_table']
+            assert rest in ([], ['-q', '-k', 'lag_table'])
         else:
             assert not rest
         return
@@ -188,25 +202,20 @@ def check_launch(package: str, file: str, *arguments: str) -> None:
         assert file == 'foxglove_bridge_launch.xml'
         return
     assert package == 'fam_bundle_bringup'
-    names = runpy_names(LAUNCH / file)
+    names = argument_names(LAUNCH / file)
     for argument in arguments:
         if argument != '--show-args':
             name, _, value = argument.partition(':=')
             assert name in names
-            if name == 'scheme':
-                declarations(GROUPS['recruitment'])['scheme'].convert('scheme', value)
-            if name in ('record', 'composed'):
-                assert value in ('true', 'false')
+            allowed = LAUNCH_CHOICES.get(name)
+            assert allowed is None or value in allowed
 
 
-def runpy_names(file: Path) -> tuple[str, ...]:
+def argument_names(file: Path) -> tuple[str, ...]:
     """Return the names of a launch file's arguments without importing ``launch``."""
-    text = file.read_text()
-    made = re.search(r'^ARGUMENTS = \([^)]*\)', text, re.MULTILINE)
+    made = re.search(r'^ARGUMENTS = (\([^)]*\))', file.read_text(), re.MULTILINE)
     assert made is not None
-    scope: dict[str, Any] = {}
-    exec(made[0], scope)
-    names: tuple[str, ...] = scope['ARGUMENTS']
+    names: tuple[str, ...] = ast.literal_eval(made[1])
     return names
 
 
@@ -249,10 +258,17 @@ def check_variables(printed: Printed) -> None:
 
 
 def check_python(printed: Printed) -> None:
-    assert printed.words[1] != '-m' or printed.words[2] == 'pip'
+    if printed.words[1] == '-m':
+        assert printed.words[2:4] == ['pip', 'install']
     for word in printed.words[1:]:
         if '/' in word and not word.startswith('runs/'):
             printed.file(word)
+
+
+def check_copy(printed: Printed) -> None:
+    _, source, target = printed.words
+    printed.file(source)
+    assert Path(target).name in THEIRS or target == 'mine.yaml'
 
 
 def check_git(printed: Printed) -> None:
@@ -294,6 +310,7 @@ CHECKS: dict[str, Callable[[Printed], None]] = {
     'export': check_variables,
     'unset': check_variables,
     'python': check_python,
+    'cp': check_copy,
     'git': check_git,
     'docker': check_docker,
     **dict.fromkeys(('cd', 'source', 'rosdep', 'colcon', 'pre-commit', 'dask'), check_known),
@@ -324,9 +341,12 @@ def test_there_are_commands_and_wrong_ones_are_found() -> None:
         'ros2 param set /strain_controller strain_loop.tracking_time 0.0',
         'ros2 service call /hardware_bridge/amr std_srvs/srv/Trigger',
         'ros2 lifecycle set /hardware_bridge begin',
+        'ros2 launch fam_bundle_bringup sim.launch.py pace:=nonsense',
+        './fam test -x',
+        'python -m venv x',
         'export ROS_DISCOVERY=1',
         'docker build -f docker/Dockerfil --target runtime -t x .',
         'colcon biuld',
     ):
-        with pytest.raises((AssertionError, KeyError, ConfigurationError, LookupError)):
+        with pytest.raises((AssertionError, ConfigurationError)):
             CHECKS[program(wrong)](Printed([], wrong))

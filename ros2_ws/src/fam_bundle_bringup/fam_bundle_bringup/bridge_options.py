@@ -81,13 +81,23 @@ def hardware_of(
     """
     if backend is None:
         return None
+    hardware = rig_for(path, configuration)
+    if backend not in SIMULATED and not agreed():
+        raise ConfigurationError(f'--backend {backend}: the valves were not told to move')
+    return hardware
+
+
+def rig_for(path: Path | None, configuration: Configuration) -> HardwareFile:
+    """
+    Return the rig in ``path``, the simulated one if there is none.
+
+    Raises ConfigurationError unless it has a valve for each motor unit.
+    """
     path = path or default_configuration().with_name('volts_calibration.yaml')
     hardware = load_hardware(path)
     units, valves = len(configuration.fam.count), len(hardware.calibration.valves)
     if valves != units:
         raise ConfigurationError(f'{path}: {valves} valves for {units} motor units; must be equal')
-    if backend not in SIMULATED and not agreed():
-        raise ConfigurationError(f'--backend {backend}: the valves were not told to move')
     return hardware
 
 

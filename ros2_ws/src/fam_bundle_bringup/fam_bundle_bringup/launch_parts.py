@@ -24,7 +24,7 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fam_bundle_bringup.bridge_options import SIMULATED
+from fam_bundle_bringup.bridge_options import rig_for, SIMULATED
 from fam_bundle_bringup.experiment import (
     checked_configuration,
     default_configuration,
@@ -33,7 +33,6 @@ from fam_bundle_bringup.experiment import (
 from fam_bundle_bringup.graph import LOOP_LISTENERS, nodes_of
 from fam_bundle_bringup.this_machine import loopback, OVERRULE
 from fam_bundle_io.hardware.backend import backend_names
-from fam_bundle_io.hardware.calibration import load_hardware
 from fam_bundle_model.doubts import doubts
 from fam_bundle_model.parameters import Configuration, PACES, SCHEMES, write_yaml
 from fam_bundle_model.schema import ConfigurationError
@@ -269,10 +268,8 @@ def mock(values: Values, folder: Path) -> list[Bundle]:
     """Return the bundle with the hardware bridge and a card that moves nothing."""
     backend = values['simulated_backend']
     configuration = configuration_of(values, {'bridge': {'backend': backend}})
-    hardware = load_hardware(default_configuration().with_name('volts_calibration.yaml'))
-    check_valves(configuration, len(hardware.calibration.valves), 'volts_calibration.yaml')
-    written = folder / 'hardware.yaml'
-    configuration = with_bridge(configuration, configuration.run.pace, hardware, written)
+    rig, written = rig_for(None, configuration), folder / 'hardware.yaml'
+    configuration = with_bridge(configuration, configuration.run.pace, rig, written)
     return [bundle(values, folder, configuration, bridge=True)]
 
 
@@ -282,15 +279,8 @@ def hardware(values: Values, folder: Path) -> list[Bundle]:
     bridge = {'backend': values['backend'], 'hardware': str(path), 'start': values['start']}
     changes = {'bridge': bridge, 'run': {'pace': 'realtime'}}
     configuration = configuration_of(values, changes)
-    check_valves(configuration, len(load_hardware(path).calibration.valves), str(path))
+    rig_for(path, configuration)
     return [bundle(values, folder, configuration, bridge=True)]
-
-
-def check_valves(configuration: Configuration, valves: int, file: str) -> None:
-    """Raise ConfigurationError unless there is a valve for each motor unit."""
-    units = len(configuration.fam.count)
-    if valves != units:
-        raise ConfigurationError(f'{file}: {valves} valves for {units} motor units; must be equal')
 
 
 def record(values: Values, folder: Path) -> list[Bundle]:
