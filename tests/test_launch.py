@@ -110,7 +110,8 @@ def test_every_choice_of_every_argument_starts_what_exists(launched: Any, parts:
                     for node in bundle.nodes:
                         assert os.access(executable(node.package, node.executable), os.X_OK)
                         assert int(node.additional_env[VARIABLE]) == os.getpid()
-                        load_configuration(node.file())
+                    for file in {node.file() for node in bundle.nodes}:
+                        load_configuration(file)
 
 
 @pytest.mark.parametrize('composed', ['true', 'false'])
@@ -131,12 +132,19 @@ def test_sim_starts_the_processes_of_the_runner(launched: Any, composed: str, re
 
 def test_arguments_reach_every_node(launched: Any) -> None:
     (bundle,) = launched(
-        'sim', scheme='lag', pace='realtime', namespace='left', log_level='warn', record='true'
+        'sim',
+        scheme='lag',
+        pace='realtime',
+        cycles='7',
+        namespace='left',
+        log_level='warn',
+        record='true',
     )
     for node in bundle.nodes:
         configuration = load_configuration(node.file())
         assert configuration.recruitment.scheme == 'lag'
         assert configuration.run.pace == 'realtime'
+        assert configuration.reference.cycles == 7
         assert node.namespace == 'left'
         assert node.ros_arguments[-2:] == ['--log-level', 'warn']
 
@@ -183,6 +191,8 @@ def test_a_recorder_alone_has_no_owner(launched: Any) -> None:
     [
         ('sim', {'params_file': 'none.yaml'}, ('none.yaml',)),
         ('sim', {'scheme': 'lga'}, ('lga',)),
+        ('sim', {'cycles': '0'}, ('reference.cycles', '0', '>= 1')),
+        ('sim', {'cycles': 'two'}, ('reference.cycles', 'two')),
         ('sim', {'record': 'true', 'bag': '.'}, ('bag = ', 'exists')),
         ('hardware', {'backend': 'quanser', 'hardware': 'none.yaml'}, ('none.yaml',)),
         ('hardware', {'backend': 'volts', 'hardware': str(TEMPLATE)}, ('volts',)),
@@ -273,6 +283,7 @@ def test_traffic_stays_here_unless_a_network_was_chosen(
     monkeypatch.setattr(parts, 'UnsetEnvironmentVariable', lambda name: (name, None))
     monkeypatch.setattr(parts, 'LogInfo', lambda msg: msg)
     monkeypatch.setenv('ROS_LOCALHOST_ONLY', '0')  # no choice
+    monkeypatch.delenv('RMW_IMPLEMENTATION', raising=False)
     if chosen:
         monkeypatch.setenv(chosen, 'SUBNET')
         assert parts.network() == [f'network as chosen: {chosen}=SUBNET']
@@ -281,6 +292,11 @@ def test_traffic_stays_here_unless_a_network_was_chosen(
         assert 'loopback' in said
         assert ('ROS_LOCALHOST_ONLY', None) in kept
         assert dict(kept)['FASTRTPS_DEFAULT_PROFILES_FILE'].endswith('fastdds_loopback.xml')
+        monkeypatch.setenv('RMW_IMPLEMENTATION', 'rmw_cyclonedds_cpp')
+        said, *kept = parts.network()
+        assert 'rmw_cyclonedds_cpp' in said
+        assert dict(kept)['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+        assert 'RMW_IMPLEMENTATION' not in dict(kept)
 
 
 @pytest.mark.parametrize('ended', ['after', 'before'])

@@ -23,8 +23,9 @@ from fam_bundle_control.pressure_controller_node import PressureController
 from fam_bundle_control.recruitment_supervisor_node import RecruitmentSupervisor
 from fam_bundle_control.strain_controller_node import StrainController
 from fam_bundle_io.bag import read_bag
-from fam_bundle_io.bag_recorder_node import BagRecorder
+from fam_bundle_io.bag_recorder_node import BagRecorder, PARAMETERS
 from fam_bundle_io.hardware_bridge_node import HardwareBridge
+from fam_bundle_io.report import reported_runs
 from fam_bundle_model.parameters import Configuration, write_yaml
 from fam_bundle_msgs.msg import BundleState
 from fam_bundle_node.qos import RECORDER_SUBSCRIPTION
@@ -115,6 +116,23 @@ def test_a_dump_of_the_recorder_gives_the_same_one_but_for_its_folder(
     assert again == first
 
 
+def test_the_recorders_own_parameters_are_described(alone: None, tmp_path: Path) -> None:
+    rclpy.init(args=['--ros-args', '-p', f'bag.folder:={tmp_path / "a"}'])
+    try:
+        node = BagRecorder()
+        described = node.describe_parameters([f'bag.{name}' for name in PARAMETERS])
+        node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+    assert all(d.description and d.read_only for d in described)
+    ranges = {d.name: [*d.integer_range, *d.floating_point_range] for d in described}
+    assert {name for name, given in ranges.items() if given} == {
+        'bag.split_size',
+        'bag.split_duration',
+    }
+    assert all(given[0].from_value == 0 for given in ranges.values() if given)
+
+
 def set_in(client: Node, node: str, values: dict[str, float], listen: Any) -> Any:
     service = client.create_client(SetParametersAtomically, f'{node}/set_parameters_atomically')
     parameters = [Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
@@ -170,6 +188,8 @@ def test_a_run_with_changes_is_replayed_to_the_last_bit(
     assert sorted(found['node']) == sorted(node for node, _ in changes)
     assert found['tick'].between(1, 11_998).all(), 'in mid-run'
     assert replay.run_replay(tmp_path / 'bag', None, None)
+    (reported,), _ = reported_runs(tmp_path / 'bag', 'changed')
+    assert any('3 changes of parameters' in said for said in reported.numbers['warnings'])
     whole = replay.changes_of
     for node in {node for node, _ in changes}:
 

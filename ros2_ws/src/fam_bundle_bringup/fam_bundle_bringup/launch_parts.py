@@ -83,6 +83,7 @@ ARGUMENTS = {
     'pace': Argument(
         'what paces the graph: each other, or a clock', AS_CONFIGURED, (AS_CONFIGURED, *PACES)
     ),
+    'cycles': Argument('cycles of the reference until the run ends', AS_CONFIGURED),
     'composed': Argument('all nodes in one process', 'false', BOOLEANS),
     'record': Argument('record all topics of the bundle to the folder bag', 'false', BOOLEANS),
     'bag': Argument('folder of the bag, which must not exist', 'bag'),
@@ -150,11 +151,17 @@ def network() -> list[Any]:
         return [LogInfo(msg=f'network as chosen: {", ".join(chosen)}')]
     # Not a choice, and set to 0 it would overrule the profile.
     cleared = [UnsetEnvironmentVariable(name) for name in OVERRULE]
-    kept = [SetEnvironmentVariable(name, value) for name, value in loopback().items()]
+    middleware = os.environ.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp'
+    said, kept = 'the loopback of this machine', loopback()
+    if not middleware.startswith('rmw_fastrtps'):  # it reads no profile of Fast DDS
+        said, kept = (
+            f'this machine, by {middleware}',
+            {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'},
+        )
     return [
-        LogInfo(msg='network: the loopback of this machine (docs/networks.md)'),
+        LogInfo(msg=f'network: {said} (docs/networks.md)'),
         *cleared,
-        *kept,
+        *(SetEnvironmentVariable(name, value) for name, value in kept.items()),
     ]
 
 
@@ -206,6 +213,7 @@ def configuration_of(values: Values, changes: dict[str, dict[str, Any]]) -> Conf
     for name, (group, parameter) in {
         'scheme': ('recruitment', 'scheme'),
         'pace': ('run', 'pace'),
+        'cycles': ('reference', 'cycles'),
     }.items():
         if values.get(name, AS_CONFIGURED) != AS_CONFIGURED:
             changes.setdefault(group, {})[parameter] = values[name]

@@ -23,6 +23,7 @@ ARGUMENTS = (
     'hardware',
     'start',
     'scheme',
+    'cycles',
     'record',
     'bag',
     'log_level',

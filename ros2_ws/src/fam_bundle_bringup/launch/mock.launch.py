@@ -21,6 +21,7 @@ ARGUMENTS = (
     'namespace',
     'simulated_backend',
     'scheme',
+    'cycles',
     'pace',
     'record',
     'bag',

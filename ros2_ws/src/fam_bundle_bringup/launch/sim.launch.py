@@ -20,6 +20,7 @@ ARGUMENTS = (
     'params_file',
     'namespace',
     'scheme',
+    'cycles',
     'pace',
     'composed',
     'record',

@@ -19,6 +19,7 @@ from fam_bundle_bringup import launch_parts
 ARGUMENTS = (
     'params_file',
     'scheme',
+    'cycles',
     'pace',
     'composed',
     'record',

@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""First-order low-pass filters, alone and four in a row."""
+"""
+First-order low-pass filters, alone and four in a row.
+
+Textbook (backward Euler); the paper filters none of its signals.
+"""
 
 from typing import NamedTuple
 

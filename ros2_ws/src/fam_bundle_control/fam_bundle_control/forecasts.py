@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What was expected for now, some time ago: the measure of a predictor."""
+"""
+What was expected for now, some time ago: the measure of a predictor.
+
+Ours: the paper does not say how far its prediction (equation 14) was off.
+"""
 
 from typing import NamedTuple
 

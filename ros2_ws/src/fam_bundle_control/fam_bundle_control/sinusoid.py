@@ -15,11 +15,11 @@
 """
 An unknown sinusoid with an offset, followed as it goes on: its frequency and its phase.
 
-For ``x = c + A sin(w t + p)`` the third derivative is ``-w^2`` times the first, whatever c, A and
-p are. Both are taken from a cascade of low-pass filters, and w^2 is their least-squares quotient
-with exponential forgetting: no guess of the frequency is needed, and none can be stuck in a wrong
-one. At a known w the cascade's gain and phase are known, so that its delay can be taken back. On
-a straight line w goes to its lower bound, and the sinusoid is a line over any lag.
+Ours. For ``x = c + A sin(w t + p)`` the third derivative is ``-w^2`` times the first, whatever c,
+A and p are. Both are taken from a cascade of low-pass filters, and w^2 is their least-squares
+quotient with exponential forgetting: no guess of the frequency is needed, and none can be stuck in
+a wrong one. At a known w the cascade's gain and phase are known, so that its delay can be taken
+back. On a straight line w goes to its lower bound, and the sinusoid is a line over any lag.
 """
 
 import math

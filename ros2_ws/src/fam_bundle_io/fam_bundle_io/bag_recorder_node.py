@@ -43,11 +43,11 @@ from fam_bundle_io.completeness import (
 from fam_bundle_io.message_definitions import complete_definition
 from fam_bundle_model.parameters import Configuration, GROUPS, ProcessParameters, yaml_text
 from fam_bundle_model.schema import ConfigurationError
-from fam_bundle_node.declare import declare_configuration
+from fam_bundle_node.declare import declare_configuration, dynamic, LARGEST
 from fam_bundle_node.network import chosen_network, NOT_CHOSEN
 from fam_bundle_node.parent import end_with_parent
 from fam_bundle_node.tuning import tune
-from rcl_interfaces.msg import ParameterDescriptor
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange
 import rclpy
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -85,6 +85,13 @@ PARAMETERS = {
     'topics': (['*', '/diagnostics'], 'topics or patterns, relative to the namespace or absolute'),
     'split_size': (0, 'bytes after which a new file begins [B], 0: never'),
     'split_duration': (0.0, 'time after which a new file begins [s], 0: never'),
+}
+
+RANGES: dict[str, dict[str, Any]] = {
+    'split_size': {'integer_range': [IntegerRange(from_value=0, to_value=2**63 - 1)]},
+    'split_duration': {
+        'floating_point_range': [FloatingPointRange(from_value=0.0, to_value=LARGEST)]
+    },
 }
 
 
@@ -140,10 +147,11 @@ class BagRecorder(Node):
     def _declare(self) -> dict[str, Any]:
         given: dict[str, Any] = {}
         for name, (default, text) in PARAMETERS.items():
-            # Dynamic, so that 60 serves where a float is wanted.
-            descriptor = ParameterDescriptor(description=text, read_only=True, dynamic_typing=True)
-            value = self.declare_parameter(f'bag.{name}', default, descriptor).value
+            value = self.declare_parameter(f'bag.{name}', default, dynamic()).value
             given[name] = checked(f'bag.{name}', value, type(default))
+            # Only once the value is known to be good: ROS refuses a bad one in other words.
+            ranges = RANGES.get(name, {})
+            self.set_descriptor(f'bag.{name}', dynamic(description=text, read_only=True, **ranges))
         if not given['folder']:
             raise ConfigurationError("bag.folder = '': must name a folder that does not exist")
         return given

@@ -48,7 +48,7 @@ class Window(NamedTuple):
 
 def tracking(trace: Trace, start: float, stop: float) -> Tracking:
     """
-    Return the metrics over ``start <= time < stop`` (s).
+    Return the metrics over ``start <= time < stop`` (s), equations 17 and 18.
 
     Each tick stands for the time until the next one, or until ``stop``: in real time periods can
     be skipped.

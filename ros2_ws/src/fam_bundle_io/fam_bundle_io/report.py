@@ -150,6 +150,12 @@ def _reported(
     runs = int(runs_of(bag.tables[f'{namespace}/{LOOP[STATE]}']).max()) + 1
     if runs > 1:
         warnings.append(f'{runs} runs in the bag: this is the last')
+    changes = bag.tables.get(f'{namespace}/parameter_changes')
+    if changes is not None and len(changes):
+        warnings.append(
+            f'{plural(len(changes), "change")} of parameters while the nodes ran '
+            f'({namespace}/parameter_changes): the hash is that of the first ones'
+        )
     time, step = trace['time'], steps(trace)
     whole = Window(float(time[0]), float(time[-1] + step[-1]))
     told = configuration is not None or 'strain_reference' not in run.missing

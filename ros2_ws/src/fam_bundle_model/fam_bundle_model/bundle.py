@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Motor units in parallel: the bundle's force, its inverse in strain, and what it can reach."""
+"""
+Motor units in parallel: the bundle's force, its inverse in strain, and what it can reach.
+
+The sum over units is the paper's (equation 11); inverse and reach are ours (docs/model.md).
+"""
 
 from typing import NamedTuple
 

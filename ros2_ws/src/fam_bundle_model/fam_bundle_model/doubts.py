@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""What a configuration may ask and hardly means: a loop that rings, units in no order of size."""
+"""
+What a configuration may ask and hardly means: a loop that rings, units in no order of size.
+
+When a loop rings is our derivation, "Gains and the size of a unit" in docs/model.md.
+"""
 
 import math
 from typing import NamedTuple

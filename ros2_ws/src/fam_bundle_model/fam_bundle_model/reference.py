@@ -18,6 +18,9 @@ The strain to be tracked, as a function of time: every kind of waveform is one l
 A law is sines over polynomials. Before it begins it is at rest at its first strain, after its end
 at its last one. Harmonic kinds are ``a (1 - cos(phase))``, which begins at rest at zero; all
 others are polynomials of time of at most fifth degree, one piece after another.
+
+The paper tracks a sine of which it gives amplitude and frequency; that it begins at rest at zero
+strain is our reading, all other kinds are ours.
 """
 
 from collections.abc import Callable, Sequence

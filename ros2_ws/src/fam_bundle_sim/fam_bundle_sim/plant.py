@@ -17,6 +17,9 @@ The simulated rig: source, valves, hoses, bundle and hanging load.
 
 The oil content of each unit is a state and its pressure follows from it, so that oil is conserved
 to rounding. Integrated by the classical Runge-Kutta method at a fixed number of sub-steps.
+
+Flow, pressure and forces are equations 1-8 of the paper as in docs/model.md, the source its
+Figure 10; mass, damping and friction of the load and the lag of the spools are textbook.
 """
 
 import math

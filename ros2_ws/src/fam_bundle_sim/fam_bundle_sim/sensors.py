@@ -12,7 +12,11 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Simulated sensors: seeded noise and finite resolution on top of the true values."""
+"""
+Simulated sensors: seeded noise and finite resolution on top of the true values.
+
+Ours: the paper gives no noise and no resolution.
+"""
 
 from collections.abc import Iterator
 from typing import NamedTuple
