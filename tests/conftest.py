@@ -2,6 +2,7 @@
 """Shared pieces of the tests of the whole system."""
 
 from collections.abc import Callable, Iterator
+import fcntl
 import functools
 import os
 from pathlib import Path
@@ -40,13 +41,20 @@ def recorded_run(
     """
     Return what gives the folder of a quick experiment through the graph, run once a scheme.
 
-    A bag is with it.
+    A bag is with it. Test processes side by side share them.
     """
-    folder = tmp_path_factory.mktemp('runs')
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if 'PYTEST_XDIST_WORKER' in os.environ else base) / 'runs'
+    folder.mkdir(exist_ok=True)
 
     @functools.cache
     def run(scheme: str) -> Path:
-        run_experiment(quick(scheme), 'lockstep', folder / scheme, record=True)
+        with (folder / f'{scheme}.lock').open('w') as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not (folder / scheme).exists():
+                made = folder / f'{scheme}.{os.getpid()}'
+                run_experiment(quick(scheme), 'lockstep', made, record=True)
+                made.rename(folder / scheme)
         return folder / scheme
 
     return run

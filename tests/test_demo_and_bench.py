@@ -18,8 +18,6 @@ from fam_bundle_model.schema import ConfigurationError
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.alone
-
 FIGURES = {
     'figure_06_response',
     'figure_07_prediction',
@@ -118,6 +116,7 @@ def test_a_demo_takes_only_its_own_bag_away(tmp_path: Path) -> None:
     assert (bag / 'thesis.tex').exists()
 
 
+@pytest.mark.alone
 def test_bench_measures_every_candidate(
     quick: Callable[..., Configuration], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
