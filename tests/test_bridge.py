@@ -32,9 +32,12 @@ Make = Callable[..., Configuration]
 SHORT = {'amplitude': 0.06, 'frequency': 0.5, 'cycles': 1}
 
 
+VOLTS = default_configuration().with_name('volts_calibration.yaml')
+
+
 @pytest.fixture(scope='module')
 def hardware() -> HardwareFile:
-    return load_hardware(default_configuration().with_name('volts_calibration.yaml'))
+    return load_hardware(VOLTS)
 
 
 def with_bits(hardware: HardwareFile, bits: int) -> HardwareFile:
@@ -183,6 +186,8 @@ def test_an_operator_leads_it_by_hand(quick: Make, hardware: HardwareFile, tmp_p
 def test_a_card_that_is_not_there_is_said(
     quick: Make, hardware: HardwareFile, tmp_path: Path
 ) -> None:
+    own = dataclasses.replace(hardware.calibration, id='rig 7')
+    hardware = dataclasses.replace(hardware, calibration=own)
     configuration = prepared(quick, hardware, tmp_path, 'inactive')
     quanser = dataclasses.replace(configuration.bridge, backend='quanser')
     write_yaml(dataclasses.replace(configuration, bridge=quanser), tmp_path / 'p.yaml')
@@ -200,6 +205,7 @@ def test_a_card_that_is_not_there_is_said(
     [
         ({'hardware': 'no.yaml'}, 'no.yaml: cannot be read'),
         ({'backend': 'none'}, 'backend none: not registered'),
+        ({'backend': 'quanser'}, 'is that of the simulated rig; quanser needs'),
         ({'start': 'now'}, 'bridge.start = now: must be one of'),
     ],
 )
@@ -230,6 +236,10 @@ def test_the_bridge_refuses_in_one_line(
         (('--backend', 'volts', '--pace', 'offline'), '--pace offline has no bridge'),
         (('--backend', 'volts', '--hardware', 'no.yaml'), 'no.yaml: cannot be read'),
         (('--backend', 'quanser'), 'needs --hardware FILE'),
+        (
+            ('--backend', 'quanser', '--pace', 'realtime', '--hardware', VOLTS),
+            'is that of the simulated rig; quanser needs',
+        ),
     ],
 )
 def test_options_that_do_not_fit_are_refused_in_one_line(

@@ -23,9 +23,8 @@ import pytest
 import yaml
 
 FILES = Path(__file__).parents[1] / 'ros2_ws/src/fam_bundle_bringup/launch'
-TEMPLATE = FILES.parent / 'config' / 'volts_calibration.yaml'
+VOLTS = FILES.parent / 'config' / 'volts_calibration.yaml'
 NAMES = ('controllers', 'hardware', 'mock', 'record', 'sim', 'two_bundles')
-NEEDED = {'hardware': {'backend': 'quanser', 'hardware': str(TEMPLATE)}}
 RECORDER = ('fam_bundle_io', 'bag_recorder')
 
 
@@ -54,6 +53,15 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     yield launch_parts
     for name in (*added, launch_parts.__name__):
         del sys.modules[name]
+
+
+@pytest.fixture
+def needed(tmp_path: Path) -> dict[str, dict[str, str]]:
+    """Return the arguments without a default, by launch file; the rig is what passes for one."""
+    content = yaml.safe_load(VOLTS.read_text())
+    file = tmp_path / 'rig.yaml'
+    file.write_text(yaml.safe_dump({**content, 'id': 'rig 7'}))
+    return {'hardware': {'backend': 'quanser', 'hardware': str(file)}}
 
 
 @pytest.fixture
@@ -98,11 +106,13 @@ def test_every_argument_says_what_it_is_for_and_its_default_is_a_choice(parts: A
             assert argument.default in argument.choices
 
 
-def test_every_choice_of_every_argument_starts_what_exists(launched: Any, parts: Any) -> None:
+def test_every_choice_of_every_argument_starts_what_exists(
+    launched: Any, parts: Any, needed: dict[str, dict[str, str]]
+) -> None:
     for name in NAMES:
         for argument in arguments_of(name):
             for choice in parts.ARGUMENTS[argument].choices or (None,):
-                given = dict(NEEDED.get(name, {}))
+                given = dict(needed.get(name, {}))
                 if choice is not None:
                     given[argument] = choice
                 for bundle in launched(name, **given):
@@ -163,10 +173,12 @@ def test_two_bundles_have_namespaces_files_and_bags_of_their_own(launched: Any) 
     assert 'left' in Path(left.nodes[0].ros_arguments[3]).read_text()
 
 
-def test_mock_arms_a_card_that_moves_nothing_and_hardware_arms_none(launched: Any) -> None:
+def test_mock_arms_a_card_that_moves_nothing_and_hardware_arms_none(
+    launched: Any, needed: dict[str, dict[str, str]]
+) -> None:
     bridges = []
     for name in ('mock', 'hardware'):
-        (bundle,) = launched(name, **NEEDED.get(name, {}))
+        (bundle,) = launched(name, **needed.get(name, {}))
         assert (bundle.owner.package, bundle.owner.executable) == BRIDGE
         configuration = load_configuration(bundle.owner.file())
         bridges.append((configuration.bridge.backend, configuration.bridge.start))
@@ -195,7 +207,8 @@ def test_a_recorder_alone_has_no_owner(launched: Any) -> None:
         ('sim', {'cycles': 'two'}, ('reference.cycles', 'two')),
         ('sim', {'record': 'true', 'bag': '.'}, ('bag = ', 'exists')),
         ('hardware', {'backend': 'quanser', 'hardware': 'none.yaml'}, ('none.yaml',)),
-        ('hardware', {'backend': 'volts', 'hardware': str(TEMPLATE)}, ('volts',)),
+        ('hardware', {'backend': 'volts', 'hardware': str(VOLTS)}, ('volts',)),
+        ('hardware', {'backend': 'quanser', 'hardware': str(VOLTS)}, ('simulated rig', 'quanser')),
         ('hardware', {'backend': 'quanser'}, ('hardware',)),
         ('mock', {'params_file': str(FILES.parent / 'config/three_units.yaml')}, ('2', '3')),
     ],

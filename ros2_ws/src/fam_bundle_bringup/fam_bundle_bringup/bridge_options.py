@@ -19,12 +19,10 @@ from pathlib import Path
 import sys
 
 from fam_bundle_bringup.experiment import default_configuration
-from fam_bundle_io.hardware.backend import backend_names
+from fam_bundle_io.hardware.backend import backend_names, check_rig, SIMULATED
 from fam_bundle_io.hardware.calibration import HardwareFile, load_hardware
 from fam_bundle_model.parameters import Configuration
 from fam_bundle_model.schema import ConfigurationError
-
-SIMULATED = ('volts', 'mock')  # backends that move nothing
 
 
 def add_bridge_options(command: argparse.ArgumentParser) -> None:
@@ -81,23 +79,30 @@ def hardware_of(
     """
     if backend is None:
         return None
-    hardware = rig_for(path, configuration)
+    hardware = rig_for(path, configuration, backend)
     if backend not in SIMULATED and not agreed():
         raise ConfigurationError(f'--backend {backend}: the valves were not told to move')
     return hardware
 
 
-def rig_for(path: Path | None, configuration: Configuration) -> HardwareFile:
-    """
-    Return the rig in ``path``, the simulated one if there is none.
+def simulated_hardware() -> Path:
+    """Return the hardware file of the simulated rig."""
+    return default_configuration().with_name('volts_calibration.yaml')
 
-    Raises ConfigurationError unless it has a valve for each motor unit.
+
+def rig_for(path: Path | None, configuration: Configuration, backend: str) -> HardwareFile:
     """
-    path = path or default_configuration().with_name('volts_calibration.yaml')
+    Return the rig in ``path``, the simulated one if there is none and ``backend`` needs no other.
+
+    Raises ConfigurationError where it is no rig for ``backend`` or this bundle.
+    """
+    if path is None and backend not in SIMULATED:
+        raise ConfigurationError(
+            f'--backend {backend}: needs --hardware FILE, the calibration of this very rig'
+        )
+    path = path or simulated_hardware()
     hardware = load_hardware(path)
-    units, valves = len(configuration.fam.count), len(hardware.calibration.valves)
-    if valves != units:
-        raise ConfigurationError(f'{path}: {valves} valves for {units} motor units; must be equal')
+    check_rig(hardware, path, backend, len(configuration.fam.count))
     return hardware
 
 

@@ -264,16 +264,16 @@ def check_backend(name: str) -> Result:
 
 def check_hardware(path: Path | None, backend: str) -> Result:
     """Check that the hardware file is whole and made for this rig."""
-    from fam_bundle_bringup.bridge_options import SIMULATED
+    from fam_bundle_bringup.bridge_options import simulated_hardware
+    from fam_bundle_io.hardware.backend import is_simulated_rig, SIMULATED
     from fam_bundle_io.hardware.calibration import load_hardware
     from fam_bundle_model.schema import ConfigurationError
 
-    simulated = simulated_hardware()
     if path is None:
         if backend not in SIMULATED:
             cure = 'copy config/hardware_calibration_template.yaml, fill it in: docs/hardware.md'
             return Result(MISSING, 'no --hardware FILE', cure)
-        path = simulated
+        path = simulated_hardware()
     blank = unfilled(path)
     if blank:
         more = f' and {len(blank) - 4} more' if len(blank) > 4 else ''
@@ -288,21 +288,16 @@ def check_hardware(path: Path | None, backend: str) -> Result:
     found = f'{calibration.id}: {inputs} inputs, {outputs} outputs, hash {calibration.hash()[:12]}'
     if backend in SIMULATED:
         return Result(OK, found)
-    if calibration.hash() == load_hardware(simulated).calibration.hash():
-        return Result(MISSING, f'{path} is that of the simulated rig', 'name that of yours')
+    if is_simulated_rig(calibration):
+        return Result(
+            MISSING, f'{path} is that of the simulated rig', 'give yours an id of its own'
+        )
     if backend not in hardware.options:
         return Result(WARNING, f'{found}; no options in backends.{backend}', 'which card?')
     if hardware.limits.frozen_samples == 0:
         cure = 'a transducer that hangs is not seen: 500'
         return Result(WARNING, f'{found}; limits.frozen_samples = 0', cure)
     return Result(OK, found)
-
-
-def simulated_hardware() -> Path:
-    """Return the hardware file of the simulated rig."""
-    from fam_bundle_bringup.experiment import default_configuration
-
-    return default_configuration().with_name('volts_calibration.yaml')
 
 
 def unfilled(path: Path) -> list[str]:
@@ -330,8 +325,9 @@ def _blanks(name: str, content: Any) -> Iterator[str]:
 
 def check_configuration(path: Path | None, hardware: Path | None, backend: str) -> Result:
     """Check that the parameter file is valid and of as many motor units as the hardware file."""
-    from fam_bundle_bringup.bridge_options import SIMULATED
+    from fam_bundle_bringup.bridge_options import simulated_hardware
     from fam_bundle_bringup.experiment import checked_configuration, default_configuration
+    from fam_bundle_io.hardware.backend import SIMULATED
     from fam_bundle_io.hardware.calibration import load_hardware
     from fam_bundle_model.doubts import doubts
     from fam_bundle_model.schema import ConfigurationError

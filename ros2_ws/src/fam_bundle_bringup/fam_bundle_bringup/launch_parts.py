@@ -24,7 +24,7 @@ import os
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fam_bundle_bringup.bridge_options import rig_for, SIMULATED
+from fam_bundle_bringup.bridge_options import rig_for
 from fam_bundle_bringup.experiment import (
     checked_configuration,
     default_configuration,
@@ -32,7 +32,7 @@ from fam_bundle_bringup.experiment import (
 )
 from fam_bundle_bringup.graph import LOOP_LISTENERS, nodes_of
 from fam_bundle_bringup.this_machine import loopback, OVERRULE
-from fam_bundle_io.hardware.backend import backend_names
+from fam_bundle_io.hardware.backend import backend_names, SIMULATED
 from fam_bundle_model.doubts import doubts
 from fam_bundle_model.parameters import Configuration, PACES, SCHEMES, write_yaml
 from fam_bundle_model.schema import ConfigurationError
@@ -88,7 +88,7 @@ ARGUMENTS = {
     'record': Argument('record all topics of the bundle to the folder bag', 'false', BOOLEANS),
     'bag': Argument('folder of the bag, which must not exist', 'bag'),
     'simulated_backend': Argument(
-        'volts: our plant behind volts; mock: sensors at rest', SIMULATED[0], SIMULATED
+        'volts: our plant behind volts; mock: sensors at rest', 'volts', ('volts', 'mock')
     ),
     'backend': Argument('what drives the card', None, REAL),
     'hardware': Argument('calibration, limits and options of this very rig', None),
@@ -276,7 +276,7 @@ def mock(values: Values, folder: Path) -> list[Bundle]:
     """Return the bundle with the hardware bridge and a card that moves nothing."""
     backend = values['simulated_backend']
     configuration = configuration_of(values, {'bridge': {'backend': backend}})
-    rig, written = rig_for(None, configuration), folder / 'hardware.yaml'
+    rig, written = rig_for(None, configuration, backend), folder / 'hardware.yaml'
     configuration = with_bridge(configuration, configuration.run.pace, rig, written)
     return [bundle(values, folder, configuration, bridge=True)]
 
@@ -287,7 +287,7 @@ def hardware(values: Values, folder: Path) -> list[Bundle]:
     bridge = {'backend': values['backend'], 'hardware': str(path), 'start': values['start']}
     changes = {'bridge': bridge, 'run': {'pace': 'realtime'}}
     configuration = configuration_of(values, changes)
-    rig_for(path, configuration)
+    rig_for(path, configuration, values['backend'])
     return [bundle(values, folder, configuration, bridge=True)]
 
 

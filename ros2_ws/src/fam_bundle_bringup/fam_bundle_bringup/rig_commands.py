@@ -27,14 +27,13 @@ import time
 from types import FrameType
 from typing import Any, NamedTuple
 
-from fam_bundle_bringup.bridge_options import agreed, check_backend_name, SIMULATED
-from fam_bundle_bringup.doctor import add_doctor_options, run_doctor, simulated_hardware
+from fam_bundle_bringup.bridge_options import agreed, check_backend_name, rig_for
+from fam_bundle_bringup.doctor import add_doctor_options, run_doctor
 from fam_bundle_bringup.experiment import checked_configuration, default_configuration
-from fam_bundle_io.hardware.backend import load_backend, make_setup, Setup
+from fam_bundle_io.hardware.backend import load_backend, make_setup, Setup, SIMULATED
 from fam_bundle_io.hardware.calibration import (
     Calibration,
     HardwareFile,
-    load_hardware,
     MU_PRESSURE,
     SensorCalibration,
     SOURCE_PRESSURE,
@@ -155,21 +154,8 @@ def rig_of(options: argparse.Namespace, source: float | None = None) -> Rig:
     """
     name, simulated = options.backend, options.backend in SIMULATED
     check_backend_name(name)
-    path = options.hardware
-    if path is None:
-        if not simulated:
-            raise ConfigurationError(
-                f'--backend {name}: needs --hardware FILE, the calibration of this very rig'
-            )
-        path = simulated_hardware()
-    hardware = load_hardware(path)
-    made_up = load_hardware(simulated_hardware()).calibration.hash()
-    if not simulated and hardware.calibration.hash() == made_up:
-        raise ConfigurationError(f'--hardware {path}: is that of the simulated rig')
     configuration = checked_configuration(options.config or default_configuration())
-    units, valves = len(configuration.fam.count), len(hardware.calibration.valves)
-    if valves != units:
-        raise ConfigurationError(f'{path}: {valves} valves for {units} motor units; must be equal')
+    hardware = rig_for(options.hardware, configuration, name)
     if simulated:
         configuration = _vented(configuration, hardware.calibration, source)
     setup = make_setup(hardware, name, configuration.simulation.period, configuration)

@@ -27,7 +27,7 @@ import sys
 import time
 from typing import Any
 
-from fam_bundle_io.hardware.backend import load_backend, make_setup
+from fam_bundle_io.hardware.backend import check_rig, load_backend, make_setup
 from fam_bundle_io.hardware.calibration import hardware_text, HardwareFile, load_hardware
 from fam_bundle_io.hardware.card_thread import CardThread, Hooks
 from fam_bundle_io.hardware.monitor import Monitor, Sample
@@ -112,14 +112,10 @@ class HardwareBridge(LoopNode, LifecycleNodeMixin):
             configuration.simulation.period,
         )
         setup = make_setup(hardware, bridge.backend, period, configuration)
-        if len(setup.outputs) != self.motor_units():
-            raise ConfigurationError(
-                f'{bridge.hardware}: {len(setup.outputs)} valves for {self.motor_units()} motor '
-                'units; must be equal'
-            )
         clock = time.monotonic_ns if self.realtime else None
         nominal = configuration.source.nominal_pressure
         self.backend: Any = load_backend(bridge.backend)
+        check_rig(hardware, Path(bridge.hardware), bridge.backend, self.motor_units())
         self.monitor = Monitor(self.backend, setup, hardware.limits, nominal, clock=clock)
         return CardThread(
             self.monitor,

@@ -26,15 +26,18 @@ Only ``arm`` lets a valve move, and ``make_safe`` takes that back. All calls com
 from collections.abc import Mapping
 import dataclasses
 import importlib.metadata
+from pathlib import Path
 import time
 from typing import Any, cast, Protocol
 
 from fam_bundle_io.hardware.calibration import Calibration, HardwareFile, Scaling
 from fam_bundle_model.parameters import Configuration
+from fam_bundle_model.schema import ConfigurationError
 import numpy as np
 import numpy.typing as npt
 
 GROUP = 'fam_bundle.backends'
+SIMULATED = ('volts', 'volts_card', 'mock')  # backends that move nothing
 FLOATS = np.dtype(np.float64)
 
 Volts = npt.NDArray[np.float64]
@@ -114,6 +117,28 @@ def make_setup(
         options=hardware.options.get(backend, {}),
         configuration=configuration,
     )
+
+
+def is_simulated_rig(calibration: Calibration) -> bool:
+    """Return whether a calibration is that of the simulated rig, zeroed anew or not."""
+    return calibration.id.startswith('simulated rig')
+
+
+def check_rig(hardware: HardwareFile, path: Path, backend: str, units: int) -> None:
+    """
+    Raise ConfigurationError unless the rig in ``path`` is one for ``backend``.
+
+    It must have a valve for each of ``units`` motor units, and a card that moves something must
+    have a calibration of its own: the numbers of the simulated rig are made up.
+    """
+    valves = len(hardware.calibration.valves)
+    if valves != units:
+        raise ConfigurationError(f'{path}: {valves} valves for {units} motor units; must be equal')
+    if backend not in SIMULATED and is_simulated_rig(hardware.calibration):
+        raise ConfigurationError(
+            f'{path}: id = {hardware.calibration.id}: is that of the simulated rig; {backend} '
+            'needs the calibration of its own rig, with an id of its own'
+        )
 
 
 class Backend(Protocol):
