@@ -3,6 +3,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from html import unescape
 from html.parser import HTMLParser
 import os
 from pathlib import Path
@@ -88,6 +89,20 @@ def test_every_document_has_a_page(site: Path) -> None:
         page = site / path.relative_to(ROOT).with_suffix('.html')
         page = page.with_name('index.html') if path.name == 'README.md' else page
         assert page.is_file(), path
+
+
+def test_examples_stand_on_their_pages(site: Path) -> None:
+    """A mark that the site does not know would stay where the example is to be."""
+    names = []
+    for path in sorted(ROOT.glob('docs/*.md')):
+        page = site / path.relative_to(ROOT).with_suffix('.html')
+        text = unescape(re.sub(r'<[^>]+>', '', page.read_text(encoding='utf-8')))
+        assert '--8' not in text, path.name
+        for name in re.findall(r'--8.*?["\'](\S+?)["\']', path.read_text(encoding='utf-8')):
+            names.append(name)
+            for line in (ROOT / name).read_text(encoding='utf-8').splitlines():
+                assert line.strip() in text, (path.name, line)
+    assert len(names) == len(set(names)) == 5
 
 
 def test_every_link_and_anchor_leads_somewhere(pages: dict[Path, Page]) -> None:
