@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The container files against the packages; no engine is needed, and nothing is built."""
 
+from importlib.metadata import requires
 import json
 from pathlib import Path
 import re
@@ -14,6 +15,7 @@ from fam_bundle_bringup.offline import run_offline
 from fam_bundle_bringup.processes import executable
 from fam_bundle_io.bag import read_bag, trace_of
 from fam_bundle_model.parameters import load_configuration, write_yaml
+from packaging.requirements import Requirement
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -79,6 +81,29 @@ def test_extras_are_entries_of_the_lock() -> None:
     lock = (ROOT / 'requirements/base.txt').read_text()
     for line in (ROOT / 'docker/requirements.txt').read_text().splitlines():
         assert line.startswith('#') or line in lock
+
+
+def test_extras_are_whole_but_for_what_ubuntu_has() -> None:
+    """They are installed without what they depend on."""
+    text = (ROOT / 'docker/requirements.txt').read_text()
+    there = {name.replace('_', '-') for name in re.findall(r'^([\w-]+)==', text, re.MULTILINE)}
+    ubuntu = {'numpy', 'packaging'}  # of python3-numpy and python3-matplotlib
+    python = {'python_version': '3.12', 'python_full_version': '3.12.3', 'extra': ''}
+    needed = {
+        re.sub(r'[._]', '-', found.name)
+        for name in there
+        for found in map(Requirement, requires(name) or ())
+        if found.marker is None or found.marker.evaluate(python)
+    }
+    assert needed - there - ubuntu == set()
+    assert needed & there
+
+
+def test_every_shell_of_an_image_has_its_environment() -> None:
+    """A devcontainer's terminals do not come through the entrypoint."""
+    assert 'source /environment.sh' in (ROOT / 'docker/entrypoint.sh').read_text()
+    development = DOCKERFILE[DOCKERFILE.index(' AS development') :]
+    assert re.search(r'environment\.sh.*\.bashrc', development)
 
 
 def test_devcontainer_names_a_stage() -> None:

@@ -337,6 +337,17 @@ def test_an_interrupted_step_ends_its_children_and_stays_due(tree, number, statu
     assert tree.due() == ['workspace']
 
 
+def test_a_workspace_that_colcon_built_is_not_taken_away(tree):
+    setup = tree.root / 'ros2_ws/install/setup.bash'
+    setup.parent.mkdir(parents=True)
+    setup.write_text('mine')
+    before = files(tree.root)
+    status, _, err = tree.fam('setup')
+    assert status == 2
+    assert_one_line(err, 'ros2_ws/install was built by colcon', 'ros2 run', 'remove')
+    assert files(tree.root) == before
+
+
 def test_two_at_once_build_once(tree):
     tree.build_is_due('echo once >> ../built; while [ ! -e ../go ]; do /bin/sleep 0.05; done')
     first = tree.popen('setup')
@@ -404,6 +415,22 @@ def test_run_starts_the_executable_in_the_sourced_environment(tree):
     assert variables['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SYSTEM_DEFAULT'
     assert variables['FASTRTPS_DEFAULT_PROFILES_FILE'] == str(tree.root / PROFILE)
     assert variables['RMW_IMPLEMENTATION'] == 'rmw_fastrtps_cpp'
+
+
+def test_in_a_full_installation_python_finds_the_users_own_packages(tree, monkeypatch):
+    tree.pretend_set_up()
+    module = tree.module()
+    monkeypatch.setenv('PYTHONPATH', '/extras')
+    monkeypatch.delenv('ROS_DISTRO', raising=False)
+    assert module.environment()['PYTHONPATH'] == '/ours'
+    monkeypatch.setenv('ROS_DISTRO', 'jazzy')
+    assert module.environment()['PYTHONPATH'] == '/ours:/extras'
+
+
+def test_a_full_installation_that_is_not_sourced_is_said(tree):
+    status, _, err = tree.fam('setup', ROS_DISTRO='jazzy')
+    assert status == 2
+    assert 'nothing is sourced: source /opt/ros/jazzy/setup.bash' in err
 
 
 def test_nothing_starts_that_would_use_every_network(tree):

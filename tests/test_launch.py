@@ -165,6 +165,20 @@ def test_what_is_not_given_stays_as_configured(launched: Any, tmp_path: Path) ->
     assert load_configuration(bundle.nodes[0].file()) == configured
 
 
+@pytest.mark.parametrize('space', ['', 'left'])
+def test_each_process_is_in_its_enclave_of_the_policy(launched: Any, space: str) -> None:
+    policy = (FILES.parent / 'security' / 'fam_bundle.policy.xml').read_text()
+    known = set(re.findall(r'<enclave path="&root;(/\w+)">', policy))
+    assert len(known) > 8
+    for composed in ('true', 'false'):
+        (bundle,) = launched('sim', namespace=space, composed=composed, record='true')
+        (bridge,) = launched('mock', namespace=space)
+        for node in (*bundle.nodes, *bridge.nodes):
+            words = node.ros_arguments
+            enclave = words[words.index('--enclave') + 1]
+            assert enclave.removeprefix(f'/{space}' if space else '') in known
+
+
 def test_two_bundles_have_namespaces_files_and_bags_of_their_own(launched: Any) -> None:
     left, right = launched('two_bundles', record='true')
     assert {node.namespace for node in left.nodes} == {'left'}

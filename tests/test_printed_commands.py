@@ -40,7 +40,16 @@ LAUNCH_CHOICES = {
     'composed': ('true', 'false'),
 }
 TRANSITIONS = ('configure', 'activate', 'deactivate', 'cleanup', 'shutdown')
-VARIABLES = (*CHOICES, 'RMW_IMPLEMENTATION', 'P')
+VARIABLES = (
+    *CHOICES,
+    'P',
+    'PYTHONPATH',
+    'RMW_IMPLEMENTATION',
+    'ROS_SECURITY_ENABLE',
+    'ROS_SECURITY_ENCLAVE_OVERRIDE',
+    'ROS_SECURITY_KEYSTORE',
+    'ROS_SECURITY_STRATEGY',
+)
 OWN_PARAMETERS = ('bag.folder', 'bag.topics', 'bag.split_size', 'bag.split_duration')
 
 
@@ -189,6 +198,8 @@ def check_ros2(printed: Printed) -> None:
         'service': lambda: check_service(*rest),
         'topic': lambda: check_words(rest, ['list']),
         'bag': lambda: check_words(rest, ['record', '-a']),
+        'daemon': lambda: check_known(printed),
+        'security': lambda: check_security(printed),
     }
     checks[verb]()
 
@@ -207,6 +218,8 @@ def check_launch(package: str, file: str, *arguments: str) -> None:
         if argument != '--show-args':
             name, _, value = argument.partition(':=')
             assert name in names
+            if name == 'cycles':
+                check_parameter('reference.cycles', value)
             allowed = LAUNCH_CHOICES.get(name)
             assert allowed is None or value in allowed
 
@@ -247,6 +260,13 @@ def check_service(verb: str, name: str, kind: str) -> None:
     assert service in SERVICES
 
 
+def check_security(printed: Printed) -> None:
+    check_known(printed)
+    for word in printed.words:
+        if word.endswith('.xml'):
+            printed.file(word)
+
+
 def check_variables(printed: Printed) -> None:
     verb = printed.words[0]
     for word in printed.words[verb in ('export', 'unset') :]:
@@ -260,8 +280,11 @@ def check_variables(printed: Printed) -> None:
 def check_python(printed: Printed) -> None:
     if printed.words[1] == '-m':
         assert printed.words[2:4] == ['pip', 'install']
+    else:
+        # Our packages are in the workspace, not in the virtual environment.
+        assert printed.before[-1:] == ['./fam shell']
     for word in printed.words[1:]:
-        if '/' in word and not word.startswith('runs/'):
+        if '/' in word:
             printed.file(word)
 
 
@@ -298,6 +321,10 @@ KNOWN = (
     r'cd (fam_bundle(/ros2_ws)?|ros2_ws)',
     r'source (/opt/ros/jazzy|install)/setup.bash',
     r'rosdep install --from-paths src -i -y',
+    r'pip3 install --no-deps --require-hashes --target \S+ -r \.\./docker/requirements\.txt',
+    r'ros2 daemon stop',
+    r'ros2 security create_keystore keystore',
+    r'ros2 security generate_artifacts -k keystore -p \S+\.policy\.xml',
     r'colcon build --cmake-args -DCMAKE_BUILD_TYPE=Release',
     r'colcon test(-result)?',
     r'pre-commit install',
@@ -313,7 +340,9 @@ CHECKS: dict[str, Callable[[Printed], None]] = {
     'cp': check_copy,
     'git': check_git,
     'docker': check_docker,
-    **dict.fromkeys(('cd', 'source', 'rosdep', 'colcon', 'pre-commit', 'dask'), check_known),
+    **dict.fromkeys(
+        ('cd', 'source', 'rosdep', 'colcon', 'pre-commit', 'dask', 'pip3'), check_known
+    ),
 }
 FOUND = list(commands())
 
@@ -342,8 +371,11 @@ def test_there_are_commands_and_wrong_ones_are_found() -> None:
         'ros2 service call /hardware_bridge/amr std_srvs/srv/Trigger',
         'ros2 lifecycle set /hardware_bridge begin',
         'ros2 launch fam_bundle_bringup sim.launch.py pace:=nonsense',
+        'ros2 launch fam_bundle_bringup sim.launch.py cycles:=none',
+        'ros2 security generate_artifacts -k keystore -p nowhere.policy.xml',
         './fam test -x',
         'python -m venv x',
+        'python examples/analyse_bag.py runs/one/bag',
         'export ROS_DISCOVERY=1',
         'docker build -f docker/Dockerfil --target runtime -t x .',
         'colcon biuld',

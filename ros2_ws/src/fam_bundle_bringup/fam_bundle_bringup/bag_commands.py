@@ -26,7 +26,6 @@ from fam_bundle_model.parameters import Configuration, load_configuration
 from fam_bundle_model.schema import ConfigurationError
 
 NAMES = ('report', 'replay', 'recover')
-PACKAGES = ('mcap', 'rosbags', 'zstandard', 'pandas', 'plotly')  # that only bags need
 
 
 def add_bag_commands(commands: Any) -> None:
@@ -87,7 +86,7 @@ def run_bag_command(options: argparse.Namespace) -> int:
         return 2
     except ModuleNotFoundError as error:
         package = str(error.name).partition('.')[0]
-        words = f'Python package {package} is missing: pip install {" ".join(PACKAGES)}'
+        words = f'Python package {package} is missing: docs/get_started.md, On Ubuntu'
         print(f'fam {options.command}: {words}', file=sys.stderr)
         return 2
 

@@ -332,7 +332,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise ConfigurationError('--record: --pace offline has no topics to record')
             if importlib.util.find_spec('mcap') is None:
                 raise ConfigurationError(
-                    '--record: needs the Python package mcap: pip install mcap'
+                    '--record: needs the Python package mcap: docs/get_started.md, On Ubuntu'
                 )
             if (options.out / 'bag').exists():
                 raise ConfigurationError(f'--record: {options.out}/bag exists: name another --out')

@@ -152,7 +152,7 @@ def network() -> list[Any]:
     # Not a choice, and set to 0 it would overrule the profile.
     cleared = [UnsetEnvironmentVariable(name) for name in OVERRULE]
     middleware = os.environ.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp'
-    said, kept = 'the loopback of this machine', loopback()
+    said, kept = 'the loopback of this machine', {**loopback(), 'RMW_IMPLEMENTATION': middleware}
     if not middleware.startswith('rmw_fastrtps'):  # it reads no profile of Fast DDS
         said, kept = (
             f'this machine, by {middleware}',
@@ -197,6 +197,9 @@ def shut_down(reason: str) -> EmitEvent:
 def node(package: str, executable: str, values: Values, files: Sequence[Path]) -> Node:
     """Return the action of one node, which ends with the launch."""
     arguments = [word for file in files for word in ('--params-file', str(file))]
+    # As the security policy names it; without security it says nothing.
+    space = values['namespace'].strip('/')
+    arguments += ['--enclave', f'/{space}/{executable}' if space else f'/{executable}']
     return Node(
         package=package,
         executable=executable,
