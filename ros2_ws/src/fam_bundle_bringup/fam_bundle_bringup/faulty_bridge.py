@@ -41,7 +41,7 @@ def break_method(owner: type, name: str, trigger: Path, hurt: Callable[[], None]
 
 
 def fail() -> None:
-    """Raise what nobody expects."""
+    """Raise what nobody expects: an ArithmeticError."""
     raise ArithmeticError('raised on purpose')
 
 

@@ -174,7 +174,8 @@ def dask_cluster(address: str) -> Iterator[Executor]:
     """
     Give an executor of the Dask cluster whose scheduler is at ``address``.
 
-    Raises ConfigurationError where there is none, or none can be used.
+    Raises ConfigurationError where there is none, or none can be used, and StudyStopped where a
+    worker ends in mid-study.
     """
     try:
         from distributed import Client, KilledWorker

@@ -185,7 +185,7 @@ def taut_units(
 def saturated(
     recruited: int, mu_pressure: npt.NDArray[np.float64], source_pressure: float
 ) -> bool:
-    """Return whether every recruited unit is at the source pressure already, if there is any."""
+    """Return whether every recruited unit is at the source pressure (Pa), if there is any."""
     for i in range(recruited):
         if mu_pressure[i] < SATURATED * source_pressure:
             return False

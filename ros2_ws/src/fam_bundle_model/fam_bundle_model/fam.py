@@ -119,7 +119,7 @@ def lowest_strain(law: FamLaw) -> float:
 
 @compiled
 def free_strain(law: FamLaw, pressure: float) -> float:
-    """Return the strain at which a FAM at ``pressure`` carries no force: inverse of equation 9."""
+    """Return the strain at which a FAM at ``pressure`` Pa has no force: equation 9 inverted."""
     low, high = lowest_strain(law), LARGEST_STRAIN
     strain = 0.1
     for _ in range(100):
@@ -166,7 +166,7 @@ def interpolate(
 
 @compiled
 def buckling_strain(law: FamLaw, pressure: float) -> float:
-    """Return the strain e_b beyond which a FAM at ``pressure`` is slack, its arc length fixed."""
+    """Return the strain e_b beyond which a FAM at ``pressure`` Pa is slack, its arc fixed."""
     return interpolate(law.compression, 0, law.pressure_step, pressure)[0]
 
 

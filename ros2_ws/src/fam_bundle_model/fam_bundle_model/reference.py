@@ -89,7 +89,7 @@ def reference_law(parameters: ReferenceParameters) -> Reference:
 
 
 def still(strain: float = 0.0) -> Reference:
-    """Return the trajectory that stays at ``strain``."""
+    """Return the trajectory that stays at ``strain`` (dimensionless)."""
     return _pieces([0.0], [[strain]], 0.0)
 
 

@@ -97,7 +97,7 @@ def derivative(
     command: npt.NDArray[np.float64],
     rate: npt.NDArray[np.float64],
 ) -> None:
-    """Fill ``rate`` with the time derivative of ``state`` under the spool ``command`` (units,)."""
+    """Fill ``rate`` with the change of ``state`` per s under the spool ``command`` (units,)."""
     count = len(rig.units)
     strain, speed, source = state[STRAIN], state[STRAIN_RATE], state[SOURCE_PRESSURE]
     drawn = force = 0.0

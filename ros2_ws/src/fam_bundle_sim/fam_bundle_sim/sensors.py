@@ -75,7 +75,7 @@ def measure(
     mu_pressure: npt.NDArray[np.float64],
 ) -> Truth:
     """
-    Return what the sensors read for ``true``, and turn ``mu_pressure`` (units,) into readings.
+    Return what the sensors read for ``true``, and turn ``mu_pressure`` (units,) Pa into readings.
 
     ``sample`` is one standard normal value per channel.
     """

@@ -103,7 +103,8 @@ class CardThread:
         """
         Run ``request`` in the thread and return what it returns, or raise what it raises.
 
-        Raises TimeoutError when the card has kept the thread for ``timeout`` s.
+        Raises TimeoutError when the card has kept the thread for ``timeout`` s, and RuntimeError
+        when the thread has ended.
         """
         if self._stopped or not self._thread.is_alive():
             raise RuntimeError('the thread of the card has ended')
