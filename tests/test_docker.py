@@ -22,11 +22,17 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCKERFILE = (ROOT / 'docker/Dockerfile').read_text()
 COMPOSE = yaml.safe_load((ROOT / 'docker/compose.yaml').read_text())
 QUICK = {'amplitude': 0.05, 'frequency': 0.5, 'cycles': 1}
-COPIED = re.findall(r'^COPY (?!--from)(\S+) \S+$', DOCKERFILE, re.MULTILINE)
+COPIED = [
+    path
+    for words in re.findall(r'^COPY (?!--from)(.+) \S+$', DOCKERFILE, re.MULTILINE)
+    for path in words.split()
+]
 
 
 def test_what_is_copied_is_there_and_manifests_come_first() -> None:
     assert all((ROOT / path).exists() for path in COPIED)
+    let_through = re.findall(r'^!(\S+)$', (ROOT / '.dockerignore').read_text(), re.MULTILINE)
+    assert all(any(path.startswith(part) for part in let_through) for path in COPIED)
     manifests = {str(path.relative_to(ROOT)) for path in ROOT.glob('ros2_ws/src/*/package.xml')}
     assert manifests <= set(COPIED[: COPIED.index('ros2_ws/src')])
 
