@@ -23,7 +23,13 @@ from fam_bundle_bringup.graph import (
 )
 from fam_bundle_bringup.processes import executable
 from fam_bundle_bringup.replay import run_replay
-from fam_bundle_bringup.replay_controllers import same_bits, Samples, samples_of, Stamp
+from fam_bundle_bringup.replay_controllers import (
+    same_bits,
+    Samples,
+    samples_of,
+    Stamp,
+    steps_of,
+)
 from fam_bundle_bringup.replay_plant import measured, measured_state, strain_rate
 from fam_bundle_io.bag import LOOP as NAMES
 from fam_bundle_io.bag import read_bag, run_tables
@@ -352,6 +358,29 @@ def test_what_a_lost_sample_leaves_open_is_not_judged(bag: Path, tmp_path: Path)
     assert f'pressure_reference: at {TICKS - lost - 1} ticks the law rests on' in found.notes
     # What the plant was told is known from the command of that tick.
     assert set(found.tops('from_the_start').values()) == {0.0}
+
+
+def test_what_another_recorder_may_have_lost_is_not_judged(bag: Path, tmp_path: Path) -> None:
+    """The law took the sample, though its answer is not there: only our recorder knows that."""
+    lost = 1500
+    file = parameters(tmp_path, run={'pace': 'realtime'})
+    others = edited(
+        bag,
+        tmp_path / 'others.mcap',
+        keep=lambda topic, tick: (topic, tick) != ('recruitment_state', lost),
+        records=False,
+    )
+    assert run_replay(others, file, tmp_path, '')
+    found = Found(tmp_path)
+    for (topic, _), one in found.signals.items():
+        if topic == 'recruitment_state':
+            assert (one['compared'], one['unknown']) == (lost, TICKS - lost - 1)
+    assert 'another recorder' in found.notes
+    samples = samples_of(run_in(others)['bundle_state'])
+    taken = [tick for tick in samples.tick if tick != lost]
+    for sure in (True, False):
+        known = steps_of(samples, taken, set(taken), configured(), sure=sure).known
+        assert known == [True] * lost + [sure] * (TICKS - lost - 1)
 
 
 def test_a_bag_that_begins_within_a_run_is_no_passed_test(

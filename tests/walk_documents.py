@@ -180,7 +180,9 @@ class Walk:
                     self.run(command._replace(line=line))
         process, log = self.start(command)
         began = time.monotonic()
-        if any_of(BESIDE, command.line):
+        # A plant without controllers waits for them.
+        waits = 'plant_simulator' in command.line and not self.beside
+        if waits or any_of(BESIDE, command.line):
             self.beside.append((command, process, began, log))
             self.rows.append({})  # keeps the number of its log
             time.sleep(STARTING)

@@ -228,7 +228,15 @@ def replay_of(
     notes += more
     if f'{space}/{CHANGES}' not in bag.types:
         notes.append(f'{CHANGES}: not in the bag; parameters set while it ran would not be known')
-    run = Run(samples_of(table), answers, configuration.run.pace == 'realtime', laws, changes)
+    # Only our recorder has the publishers' own numbers, by which a lost message shows.
+    sure = 'fam_bundle.provenance' in bag.records
+    realtime = configuration.run.pace == 'realtime'
+    run = Run(samples_of(table), answers, realtime, laws, changes, sure)
+    if realtime and not sure:
+        notes.append(
+            'recorded by another recorder: where an answer is missing it may be lost, so nothing '
+            'is judged until the controller starts again'
+        )
     for topic, found in answers.items():
         lacking = len(table.index.difference(found.index))
         if lacking and not run.realtime:

@@ -113,7 +113,8 @@ class Run(NamedTuple):
     One run: its samples, the tables of what answered them by topic and tick, and its pace.
 
     ``laws`` are the trajectories that were tracked, that of the beginning first; ``changes`` the
-    parameters that were set meanwhile, by node.
+    parameters that were set meanwhile, by node. ``sure`` tells that an answer which is not in the
+    bag was never given: else it may have been lost on its way to the recorder.
     """
 
     samples: Samples
@@ -121,6 +122,7 @@ class Run(NamedTuple):
     realtime: bool
     laws: list[Announcement]
     changes: Mapping[str, list[Change]] = MappingProxyType({})
+    sure: bool = True
 
 
 def samples_of(table: 'pd.DataFrame') -> Samples:
@@ -157,8 +159,8 @@ class Steps(NamedTuple):
     The steps that a law took: of which sample (its row), over which time (s), from where.
 
     ``anew`` tells that it started again there. Whether the record determines the law's state is
-    ``known``: not before its first start, nor between a step that the bag does not show and the
-    next start.
+    ``known``: not before its first start, nor between a step that the bag does not show, or
+    perhaps does not, and the next start.
     """
 
     row: list[int]
@@ -168,10 +170,17 @@ class Steps(NamedTuple):
 
 
 def steps_of(
-    samples: Samples, taken: Iterable[int], usable: Container[int], configuration: Configuration
+    samples: Samples,
+    taken: Iterable[int],
+    usable: Container[int],
+    configuration: Configuration,
+    *,
+    sure: bool = True,
 ) -> Steps:
     """
     Return the steps of a law that took the ticks ``taken``, of which the bag has ``usable``.
+
+    Unless ``sure``, it may have taken those between them too.
 
     Raises TickError when time stands still.
     """
@@ -183,6 +192,8 @@ def steps_of(
     known, last = False, None
     for tick in taken:
         unseen = last is not None and _lacks(ticks, last, tick)
+        if not sure and last is not None and tick > last + 1:
+            known = False
         last = tick
         if unseen or tick not in usable:
             known = False
@@ -455,7 +466,8 @@ def replay_controllers(
                 continue
             usable &= set(run.answers[REFERENCE].index) & set(run.answers[STATE].index)
         try:
-            steps = steps_of(samples, _taken(run, topic), usable, configuration)
+            taken = _taken(run, topic)
+            steps = steps_of(samples, taken, usable, configuration, sure=run.sure)
         except TickError as error:
             raise BagError(f'stamps of bundle_state: {error}') from None
 
