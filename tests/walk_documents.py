@@ -253,7 +253,7 @@ def environment() -> dict[str, str]:
     return kept | {'PATH': ':'.join(path)}
 
 
-def walk(folder: Path, only: str, long: bool) -> int:
+def walk(folder: Path, only: list[str], long: bool) -> int:
     made = Walk(folder)
     try:
         made.begin()
@@ -268,11 +268,11 @@ def walk(folder: Path, only: str, long: bool) -> int:
     return 1 if failed or not run else 0
 
 
-def follow(made: Walk, only: str, long: bool) -> None:
+def follow(made: Walk, only: list[str], long: bool) -> None:
     last: Command | None = None
     started_in = -1
     for command in printed():
-        if only and only not in str(command.document):
+        if not any(text in str(command.document) for text in only):
             continue
         if last and command.document != last.document:
             made.end_beside()
@@ -294,7 +294,13 @@ def follow(made: Walk, only: str, long: bool) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
     parser.add_argument('folder', type=Path, help='for the clone and the logs')
-    parser.add_argument('--only', default='', metavar='TEXT', help='documents whose path has it')
+    parser.add_argument(
+        '--only',
+        nargs='+',
+        default=[''],
+        metavar='TEXT',
+        help='documents whose path has one of these',
+    )
     parser.add_argument('--long', action='store_true', help='also test and faults')
     given = parser.parse_args()
     # In the background of a shell it is ignored, and all that is started here would ignore it.
