@@ -125,6 +125,8 @@ class Walk:
         """Clone and set up, and put the reader's own files there."""
         if not self.folder.exists():
             subprocess.run(['git', 'clone', '-q', str(ROOT), str(self.folder)], check=True)
+        # What an earlier walk left; what is ignored stays.
+        subprocess.run(['git', 'clean', '-fdq'], cwd=self.folder, check=True)
         parameters = (self.folder / CONFIG / 'lhacd.yaml').read_text()
         rig = (self.folder / CONFIG / 'volts_calibration.yaml').read_text()
         rig = re.sub(r'^id: .*$', 'id: rig 7', rig, flags=re.MULTILINE)
@@ -216,7 +218,9 @@ class Walk:
                 status = process.wait()
             good = status == 0 if early is not None else status in (0, 130, -signal.SIGINT)
             said = f'status {status}' + (' at Ctrl-C' if early is None else '')
-            traced = 'Traceback' in log.read_text(errors='replace')
+            # Dask has one of its own at Ctrl-C.
+            ours = not command.line.startswith('dask')
+            traced = ours and 'Traceback' in log.read_text(errors='replace')
             self.note(command, good and not traced, said, time.monotonic() - began, log)
         self.beside.clear()
 
