@@ -59,7 +59,7 @@ REFUSED = {
 BESIDE = (
     r'(\./fam|ros2) run fam_bundle_control ',
     r'(\./fam|ros2) run fam_bundle_io (hardware_bridge|bag_recorder) ',
-    r'ros2 launch .*realtime',
+    r'ros2 launch .*(realtime|controllers)',
     r'ros2 bag record',
     r'\./fam experiment --pace realtime --composed',
     r'\./fam top',
@@ -71,7 +71,8 @@ FIRST = {
     r'ros2 run fam_bundle_io hardware_bridge': [
         f'ros2 run fam_bundle_control {name} --ros-args --params-file FILE -p run.pace:=realtime'
         for name in CONTROLLERS
-    ]
+    ],
+    r'ros2 param describe': ['ros2 launch fam_bundle_bringup controllers.launch.py'],
 }
 SOURCED = ('colcon', 'dask', 'export', 'python', 'ros2')  # in a shell with the workspace
 PROFILE_EXISTS = 'test -e "${FASTRTPS_DEFAULT_PROFILES_FILE:-/}"'
