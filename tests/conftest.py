@@ -9,6 +9,7 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import tempfile
 from typing import Any
 
 from fam_bundle_bringup.experiment import default_configuration, run_experiment
@@ -52,7 +53,7 @@ def recorded_run(
         with (folder / f'{scheme}.lock').open('w') as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not (folder / scheme).exists():
-                made = folder / f'{scheme}.{os.getpid()}'
+                made = Path(tempfile.mkdtemp(dir=folder)) / scheme
                 run_experiment(quick(scheme), 'lockstep', made, record=True)
                 made.rename(folder / scheme)
         return folder / scheme

@@ -183,12 +183,10 @@ def test_an_operator_leads_it_by_hand(quick: Make, hardware: HardwareFile, tmp_p
         assert one.change(Transition.TRANSITION_CLEANUP)
 
 
-def test_a_card_that_is_not_there_is_said(
-    quick: Make, hardware: HardwareFile, tmp_path: Path
-) -> None:
-    own = dataclasses.replace(hardware.calibration, id='rig 7')
-    hardware = dataclasses.replace(hardware, calibration=own)
-    configuration = prepared(quick, hardware, tmp_path, 'inactive')
+def test_a_card_that_is_not_there_is_said(quick: Make, tmp_path: Path) -> None:
+    file = tmp_path / 'rig.yaml'
+    file.write_text(VOLTS.read_text().replace('simulated rig', 'rig 7'))
+    configuration = prepared(quick, load_hardware(file), tmp_path, 'inactive')
     quanser = dataclasses.replace(configuration.bridge, backend='quanser')
     write_yaml(dataclasses.replace(configuration, bridge=quanser), tmp_path / 'p.yaml')
     with own_domain():

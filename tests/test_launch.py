@@ -58,9 +58,8 @@ def parts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 @pytest.fixture
 def needed(tmp_path: Path) -> dict[str, dict[str, str]]:
     """Return the arguments without a default, by launch file; the rig is what passes for one."""
-    content = yaml.safe_load(VOLTS.read_text())
     file = tmp_path / 'rig.yaml'
-    file.write_text(yaml.safe_dump({**content, 'id': 'rig 7'}))
+    file.write_text(VOLTS.read_text().replace('simulated rig', 'rig 7'))
     return {'hardware': {'backend': 'quanser', 'hardware': str(file)}}
 
 

@@ -320,6 +320,8 @@ def check_known(printed: Printed) -> None:
 KNOWN = (
     r'cd (fam_bundle(/ros2_ws)?|ros2_ws)',
     r'source (/opt/ros/jazzy|install)/setup.bash',
+    r'sudo rosdep init',
+    r'rosdep update',
     r'rosdep install --from-paths src -i -y',
     r'pip3 install --no-deps --require-hashes --target \S+ -r \.\./docker/requirements\.txt',
     r'ros2 daemon stop',
@@ -337,11 +339,12 @@ CHECKS: dict[str, Callable[[Printed], None]] = {
     'export': check_variables,
     'unset': check_variables,
     'python': check_python,
+    'python3': check_python,
     'cp': check_copy,
     'git': check_git,
     'docker': check_docker,
     **dict.fromkeys(
-        ('cd', 'source', 'rosdep', 'colcon', 'pre-commit', 'dask', 'pip3'), check_known
+        ('cd', 'source', 'rosdep', 'colcon', 'pre-commit', 'dask', 'pip3', 'sudo'), check_known
     ),
 }
 FOUND = list(commands())
@@ -375,7 +378,7 @@ def test_there_are_commands_and_wrong_ones_are_found() -> None:
         'ros2 security generate_artifacts -k keystore -p nowhere.policy.xml',
         './fam test -x',
         'python -m venv x',
-        'python examples/analyse_bag.py runs/one/bag',
+        'python3 examples/analyse_bag.py runs/one/bag',
         'export ROS_DISCOVERY=1',
         'docker build -f docker/Dockerfil --target runtime -t x .',
         'colcon biuld',

@@ -375,12 +375,17 @@ def test_what_another_recorder_may_have_lost_is_not_judged(bag: Path, tmp_path: 
     for (topic, _), one in found.signals.items():
         if topic == 'recruitment_state':
             assert (one['compared'], one['unknown']) == (lost, TICKS - lost - 1)
-    assert 'another recorder' in found.notes
+    assert 'recruitment_state, valve_command: the recorder does not vouch' in found.notes
     samples = samples_of(run_in(others)['bundle_state'])
     taken = [tick for tick in samples.tick if tick != lost]
     for sure in (True, False):
         known = steps_of(samples, taken, set(taken), configured(), sure=sure).known
         assert known == [True] * lost + [sure] * (TICKS - lost - 1)
+    # However many: a node that had seen such a gap would have started again after it.
+    taken = [tick for tick in samples.tick if not lost <= tick < lost + 60]
+    steps = steps_of(samples, taken, set(taken), configured(), sure=False)
+    assert steps.known == [True] * lost + [False] * (TICKS - lost - 60)
+    assert not any(steps.anew[1:])
 
 
 def test_a_bag_that_begins_within_a_run_is_no_passed_test(

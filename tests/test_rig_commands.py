@@ -19,6 +19,7 @@ from fam_bundle_bringup.doctor import MISSING, OK, WARNING
 from fam_bundle_bringup.experiment import default_configuration
 from fam_bundle_io.hardware import backend as backend_module
 from fam_bundle_io.hardware.calibration import load_hardware, Scaling
+from fam_bundle_model.schema import ConfigurationError
 from fam_bundle_sim.plant import truth
 from fam_bundle_sim.volts_backend import VoltsBackend
 import numpy as np
@@ -347,13 +348,14 @@ def test_a_signal_in_the_middle_of_a_pulse_vents(name: str) -> None:
 
 @pytest.fixture
 def real(tmp_path: Path) -> Path:
-    """Return the hardware file of what passes for a real rig: another name, a card's options."""
+    """Return the hardware file of what passes for a real rig: other names, a card's options."""
+    named = tmp_path / 'named.yaml'
+    named.write_text(VOLTS.read_text().replace('simulated rig', 'rig 7'))
 
-    def rename(content: Any) -> None:
-        content['id'] = 'rig 7'
+    def choose(content: Any) -> None:
         content['backends'] = {'quanser': {'board_type': 'none'}}
 
-    return edited(VOLTS, tmp_path / 'rig.yaml', rename)
+    return edited(named, tmp_path / 'rig.yaml', choose)
 
 
 def test_a_real_rig_is_not_opened_unless_somebody_agrees(
@@ -582,6 +584,24 @@ def test_doctor_opens_no_card(monkeypatch: Patch) -> None:
     monkeypatch.setattr(backend_module, 'load_backend', lambda name: rig)
     assert run(['doctor']) == 0
     assert not rig.opened
+
+
+def test_no_line_of_the_simulated_rig_is_left_to_a_real_one(real: Path, tmp_path: Path) -> None:
+    def forget(content: Any) -> None:
+        content['sensors']['mu_pressure'][1]['calibration_id'] = ' Simulated Rig 1'
+
+    file = edited(real, tmp_path / 'forgotten.yaml', forget)
+    name = 'sensors.mu_pressure[1].calibration_id'
+    assert backend_module.made_up(load_hardware(real).calibration) == []
+    for backend in ('quanser', 'nidaqmx', 'of_another_package'):
+        with pytest.raises(ConfigurationError, match=re.escape(name)):
+            backend_module.check_rig(load_hardware(file), file, backend, 2)
+    for backend in ('volts', 'volts_card', 'mock'):
+        backend_module.check_rig(load_hardware(VOLTS), VOLTS, backend, 2)
+    found = doctor.check_hardware(file, 'quanser')
+    assert found.state == MISSING and name in found.found
+    # Whatever is changed in it: each of its lines says whose it is.
+    assert len(backend_module.made_up(load_hardware(VOLTS).calibration)) == 9
 
 
 def test_doctor_looks_into_the_hardware_file_of_a_real_rig(real: Path, tmp_path: Path) -> None:

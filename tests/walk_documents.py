@@ -3,7 +3,7 @@
 Run every command that the documents print, as printed, in a clone made for it.
 
     ./fam shell
-    python tests/walk_documents.py FOLDER --long
+    python3 tests/walk_documents.py FOLDER --long
 
 The clone is FOLDER/fam_bundle, made and set up if it is not there; logs and ``walk.json`` stand
 beside it. Commands of ``ros2`` need the real command-line tools on the path, and a plain shell has
@@ -40,13 +40,13 @@ SAMPLES = 'time,strain\n0.0,0.0\n1.0,0.05\n3.0,0.1\n5.0,0.02\n'
 STANDS_FOR = {'FILE': f'{CONFIG}/lhacd.yaml', 'NAME': 'volts', 'rig_zeroed.yaml': 'rig.yaml'}
 NOT_HERE = {
     r'git clone|cd fam_bundle': 'the walk begins in a clone',
-    r'source |rosdep |colcon build|pip3 ': 'needs Ubuntu with ROS 2 Jazzy',
+    r'source |(sudo )?rosdep |colcon build|pip3 ': 'needs Ubuntu with ROS 2 Jazzy',
     r'docker ': 'needs a container engine',
     r'pre-commit ': 'needs pre-commit, which the project does not install',
     r'ros2 launch foxglove_bridge': 'needs foxglove_bridge',
     r'\./fam shell': 'is interactive; the walk runs in one',
     r'export FASTRTPS_DEFAULT_PROFILES_FILE=/path': 'a path of the reader',
-    r'python tests/walk_documents\.py': 'is this walk',
+    r'python3 tests/walk_documents\.py': 'is this walk',
 }
 # What must be refused here, without a traceback, and the words that say why: no vendor's package
 # is installed, and nobody sits at a terminal to agree that valves move.
@@ -65,7 +65,7 @@ BESIDE = (
     r'\./fam top',
     r'dask (scheduler|worker)',
 )
-LONG = (r'\./fam (test|faults)( +#|$)', r'colcon test')
+LONG = (r'\./fam (test|faults)( +#|$)', r'colcon test', r'python3 studies/calibration')
 # What the text before a command asks for, in further terminals.
 FIRST = {
     r'ros2 run fam_bundle_io hardware_bridge': [
@@ -126,11 +126,13 @@ class Walk:
         """Clone and set up, and put the reader's own files there."""
         if not self.folder.exists():
             subprocess.run(['git', 'clone', '-q', str(ROOT), str(self.folder)], check=True)
-        # What an earlier walk left; what is ignored stays.
+        # What the documents belong to, without what an earlier walk left; what is ignored stays.
+        for words in (['fetch', '-q', str(ROOT), 'HEAD'], ['reset', '-q', '--hard', 'FETCH_HEAD']):
+            subprocess.run(['git', *words], cwd=self.folder, check=True)
         subprocess.run(['git', 'clean', '-fdq'], cwd=self.folder, check=True)
         parameters = (self.folder / CONFIG / 'lhacd.yaml').read_text()
         rig = (self.folder / CONFIG / 'volts_calibration.yaml').read_text()
-        rig = re.sub(r'^id: .*$', 'id: rig 7', rig, flags=re.MULTILINE)
+        rig = rig.replace('simulated rig', 'rig 7')
         rig += '\nbackends: {quanser: {board_type: qpid_e}}\n' if '\nbackends:' not in rig else ''
         # The reader's own files.
         for name, text in {
@@ -252,6 +254,8 @@ class Walk:
 def environment() -> dict[str, str]:
     """Return the environment without what this very shell has of a workspace."""
     ours = ('AMENT_', 'CMAKE_PREFIX', 'COLCON_', 'ROS_', 'RMW_', 'FASTRTPS_', 'VIRTUAL_ENV')
+    if 'ROS_DISTRO' in os.environ:  # an installation that is sourced, and has no workspace of ours
+        return dict(os.environ)
     kept = {k: v for k, v in os.environ.items() if not k.startswith((*ours, '_ROS', 'LD_LIB'))}
     path = [p for p in kept['PATH'].split(':') if str(ROOT) not in p]
     kept.pop('PYTHONPATH', None)
@@ -265,6 +269,8 @@ def walk(folder: Path, only: list[str], long: bool) -> int:
         follow(made, only, long)
     finally:
         made.end_beside()
+        if shutil.which('ros2'):  # its daemon lives on by itself
+            made.start(Command(ROOT, 0, 'ros2 daemon stop'))[0].wait()
         rows = [row for row in made.rows if row]
         (folder / 'walk.json').write_text(json.dumps(rows, indent=1))
     run = [row for row in rows if 'good' in row]
@@ -306,8 +312,10 @@ def main() -> int:
         metavar='TEXT',
         help='documents whose path has one of these',
     )
-    parser.add_argument('--long', action='store_true', help='also test and faults')
+    parser.add_argument('--long', action='store_true', help='also tests, faults and calibration')
     given = parser.parse_args()
+    if subprocess.check_output(['git', 'status', '--porcelain'], cwd=ROOT):
+        parser.error('the checkout has changes: commit them, for a clone of it is walked')
     # In the background of a shell it is ignored, and all that is started here would ignore it.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     return walk(given.folder.resolve(), given.only, given.long)

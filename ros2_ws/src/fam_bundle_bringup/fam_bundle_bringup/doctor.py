@@ -265,7 +265,7 @@ def check_backend(name: str) -> Result:
 def check_hardware(path: Path | None, backend: str) -> Result:
     """Check that the hardware file is whole and made for this rig."""
     from fam_bundle_bringup.bridge_options import simulated_hardware
-    from fam_bundle_io.hardware.backend import is_simulated_rig, SIMULATED
+    from fam_bundle_io.hardware.backend import made_up, MOVE_NOTHING, SIMULATED
     from fam_bundle_io.hardware.calibration import load_hardware
     from fam_bundle_model.schema import ConfigurationError
 
@@ -286,12 +286,13 @@ def check_hardware(path: Path | None, backend: str) -> Result:
     calibration = hardware.calibration
     inputs, outputs = len(calibration.sensors()), len(calibration.valves)
     found = f'{calibration.id}: {inputs} inputs, {outputs} outputs, hash {calibration.hash()[:12]}'
-    if backend in SIMULATED:
+    if backend in MOVE_NOTHING:
         return Result(OK, found)
-    if is_simulated_rig(calibration):
-        return Result(
-            MISSING, f'{path} is that of the simulated rig', 'give yours an id of its own'
-        )
+    invented = made_up(calibration)
+    if invented:
+        more = f' and {len(invented) - 1} more' if invented[1:] else ''
+        found = f'{path}: {invented[0]}{more}: that of the simulated rig'
+        return Result(MISSING, found, 'name the certificate or record of each of your own')
     if backend not in hardware.options:
         return Result(WARNING, f'{found}; no options in backends.{backend}', 'which card?')
     if hardware.limits.frozen_samples == 0:

@@ -32,7 +32,7 @@ from fam_bundle_bringup.experiment import (
 )
 from fam_bundle_bringup.graph import LOOP_LISTENERS, nodes_of
 from fam_bundle_bringup.this_machine import loopback, OVERRULE
-from fam_bundle_io.hardware.backend import backend_names, SIMULATED
+from fam_bundle_io.hardware.backend import backend_names, MOVE_NOTHING, SIMULATED
 from fam_bundle_model.doubts import doubts
 from fam_bundle_model.parameters import Configuration, PACES, SCHEMES, write_yaml
 from fam_bundle_model.schema import ConfigurationError
@@ -72,7 +72,7 @@ class Argument(NamedTuple):
     choices: Sequence[str] = ()
 
 
-REAL = [name for name in backend_names() if name not in SIMULATED]
+REAL = [name for name in backend_names() if name not in MOVE_NOTHING]
 ARGUMENTS = {
     'params_file': Argument('parameter file of the bundle', str(default_configuration())),
     'namespace': Argument('namespace of the bundle; empty: none', ''),
@@ -88,7 +88,7 @@ ARGUMENTS = {
     'record': Argument('record all topics of the bundle to the folder bag', 'false', BOOLEANS),
     'bag': Argument('folder of the bag, which must not exist', 'bag'),
     'simulated_backend': Argument(
-        'volts: our plant behind volts; mock: sensors at rest', 'volts', ('volts', 'mock')
+        'volts: our plant behind volts; mock: sensors at rest', SIMULATED[0], SIMULATED
     ),
     'backend': Argument('what drives the card', None, REAL),
     'hardware': Argument('calibration, limits and options of this very rig', None),
@@ -155,7 +155,7 @@ def network() -> list[Any]:
     said, kept = 'the loopback of this machine', {**loopback(), 'RMW_IMPLEMENTATION': middleware}
     if not middleware.startswith('rmw_fastrtps'):  # it reads no profile of Fast DDS
         said, kept = (
-            f'this machine, by {middleware}',
+            f'this machine, as far as {middleware} goes by ROS_AUTOMATIC_DISCOVERY_RANGE',
             {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'},
         )
     return [

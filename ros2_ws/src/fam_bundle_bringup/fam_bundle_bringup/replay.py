@@ -228,14 +228,13 @@ def replay_of(
     notes += more
     if f'{space}/{CHANGES}' not in bag.types:
         notes.append(f'{CHANGES}: not in the bag; parameters set while it ran would not be known')
-    # Only our recorder has the publishers' own numbers, by which a lost message shows.
-    sure = 'fam_bundle.provenance' in bag.records
     realtime = configuration.run.pace == 'realtime'
-    run = Run(samples_of(table), answers, realtime, laws, changes, sure)
-    if realtime and not sure:
+    lossy = frozenset(topic for topic in answers if realtime and not is_whole(bag, space, topic))
+    run = Run(samples_of(table), answers, realtime, laws, changes, lossy)
+    if lossy:
         notes.append(
-            'recorded by another recorder: where an answer is missing it may be lost, so nothing '
-            'is judged until the controller starts again'
+            f'{", ".join(sorted(lossy))}: the recorder does not vouch that none was lost; where '
+            'an answer is missing, nothing is judged until the controller starts again'
         )
     for topic, found in answers.items():
         lacking = len(table.index.difference(found.index))
@@ -256,6 +255,16 @@ def replay_of(
     except BagError as error:
         notes.append(str(error))
     return Replay(chosen, run, comparisons, simulated, notes)
+
+
+def is_whole(bag: Bag, space: str, topic: str) -> bool:
+    """Return whether the recorder knows of a topic that no message was lost: ours counts them."""
+    record = bag.records.get('fam_bundle.completeness', {})
+    try:
+        lost = json.loads(record.get(f'{space}/{topic}', '{}')).get('lost')
+    except (ValueError, AttributeError):
+        return False
+    return lost == 0 and record.get('dropped') == '0'
 
 
 def tracked_laws(

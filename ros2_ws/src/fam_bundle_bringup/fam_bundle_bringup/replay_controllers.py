@@ -113,8 +113,8 @@ class Run(NamedTuple):
     One run: its samples, the tables of what answered them by topic and tick, and its pace.
 
     ``laws`` are the trajectories that were tracked, that of the beginning first; ``changes`` the
-    parameters that were set meanwhile, by node. ``sure`` tells that an answer which is not in the
-    bag was never given: else it may have been lost on its way to the recorder.
+    parameters that were set meanwhile, by node. An answer on a topic in ``lossy`` which is not in
+    the bag may have been lost on its way to the recorder; on the others it was never given.
     """
 
     samples: Samples
@@ -122,7 +122,7 @@ class Run(NamedTuple):
     realtime: bool
     laws: list[Announcement]
     changes: Mapping[str, list[Change]] = MappingProxyType({})
-    sure: bool = True
+    lossy: frozenset[str] = frozenset()
 
 
 def samples_of(table: 'pd.DataFrame') -> Samples:
@@ -194,6 +194,7 @@ def steps_of(
         unseen = last is not None and _lacks(ticks, last, tick)
         if not sure and last is not None and tick > last + 1:
             known = False
+            clock.restart()  # a gap in the record is none that the node saw
         last = tick
         if unseen or tick not in usable:
             known = False
@@ -467,7 +468,7 @@ def replay_controllers(
             usable &= set(run.answers[REFERENCE].index) & set(run.answers[STATE].index)
         try:
             taken = _taken(run, topic)
-            steps = steps_of(samples, taken, usable, configuration, sure=run.sure)
+            steps = steps_of(samples, taken, usable, configuration, sure=topic not in run.lossy)
         except TickError as error:
             raise BagError(f'stamps of bundle_state: {error}') from None
 

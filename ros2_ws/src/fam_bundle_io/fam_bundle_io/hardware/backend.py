@@ -37,7 +37,8 @@ import numpy as np
 import numpy.typing as npt
 
 GROUP = 'fam_bundle.backends'
-SIMULATED = ('volts', 'volts_card', 'mock')  # backends that move nothing
+SIMULATED = ('volts', 'mock')  # in this process, paced by who asks
+MOVE_NOTHING = (*SIMULATED, 'volts_card')
 FLOATS = np.dtype(np.float64)
 
 Volts = npt.NDArray[np.float64]
@@ -119,9 +120,15 @@ def make_setup(
     )
 
 
-def is_simulated_rig(calibration: Calibration) -> bool:
-    """Return whether a calibration is that of the simulated rig, zeroed anew or not."""
-    return calibration.id.startswith('simulated rig')
+def made_up(calibration: Calibration) -> list[str]:
+    """Return what in a calibration is still that of the simulated rig, as NAME = VALUE."""
+    parts = dict(zip(calibration.names(), calibration.sensors(), strict=True))
+    named = {'id': calibration.id}
+    named |= {f'sensors.{name}.calibration_id': p.calibration_id for name, p in parts.items()}
+    for i, valve in enumerate(calibration.valves):
+        named[f'valves[{i}].calibration_id'] = valve.calibration_id
+    prefix = 'simulated rig'
+    return [f'{n} = {v}' for n, v in named.items() if v.strip().casefold().startswith(prefix)]
 
 
 def check_rig(hardware: HardwareFile, path: Path, backend: str, units: int) -> None:
@@ -134,10 +141,11 @@ def check_rig(hardware: HardwareFile, path: Path, backend: str, units: int) -> N
     valves = len(hardware.calibration.valves)
     if valves != units:
         raise ConfigurationError(f'{path}: {valves} valves for {units} motor units; must be equal')
-    if backend not in SIMULATED and is_simulated_rig(hardware.calibration):
+    invented = made_up(hardware.calibration)
+    if backend not in MOVE_NOTHING and invented:
         raise ConfigurationError(
-            f'{path}: id = {hardware.calibration.id}: is that of the simulated rig; {backend} '
-            'needs the calibration of its own rig, with an id of its own'
+            f'{path}: {invented[0]}: is that of the simulated rig; {backend} needs the '
+            'calibration of its own rig'
         )
 
 
