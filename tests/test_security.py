@@ -92,6 +92,14 @@ def test_each_process_has_one_enclave() -> None:
     assert nodes == {f'/{name}': [name] for name in alone}
 
 
+def test_among_the_enclaves_are_no_comments() -> None:
+    """`ros2 security generate_artifacts` takes each child for an enclave, and ends at one."""
+    keep = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
+    found = ElementTree.parse(POLICY, keep).getroot().find('enclaves')
+    assert found is not None
+    assert {child.tag for child in found} == {'enclave'}
+
+
 def test_composed_nodes_may_do_what_each_may() -> None:
     for profile in enclaves()['/composed_loop']:
         assert rights(profile) == allowed()[profile.attrib['node']]

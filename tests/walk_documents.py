@@ -143,6 +143,12 @@ class Walk:
         }.items():
             (self.folder / name).write_text(text)
         self.run(Command(ROOT / 'CONTRIBUTING.md', -1, './fam setup'))
+        self.start_daemon()
+
+    def start_daemon(self) -> None:
+        """Let ROS's daemon run: for who has used `ros2` before, it does."""
+        if shutil.which('ros2'):
+            self.start(Command(ROOT, 0, 'ros2 daemon start'))[0].wait()
 
     def script(self, line: str) -> str:
         for word, value in STANDS_FOR.items():
@@ -245,6 +251,7 @@ class Walk:
     def restore(self) -> None:
         """Take back what a document changed in the sources, and put away its results."""
         self.before.clear()
+        self.start_daemon()
         runs = self.folder / 'runs'
         if runs.exists():
             runs.rename(self.folder / f'runs_{len(self.rows)}')
