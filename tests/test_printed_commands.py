@@ -8,7 +8,7 @@ import importlib.util
 from pathlib import Path
 import re
 import shlex
-from typing import Any
+from typing import Any, NamedTuple
 
 from ament_index_python.packages import get_package_prefix
 from fam_bundle_bringup.cli import parser
@@ -60,19 +60,31 @@ def documents() -> list[Path]:
     return found
 
 
+class Command(NamedTuple):
+    """A printed command: where it stands, and in which block of that document."""
+
+    document: Path
+    block: int
+    line: str
+
+
+def printed() -> Iterator[Command]:
+    """Give each printed command."""
+    for document in documents():
+        for number, (language, text) in enumerate(BLOCK.findall(document.read_text())):
+            lines = [line.strip() for line in text.replace('\\\n', ' ').splitlines()]
+            lines = [line for line in lines if line and not line.startswith('#')]
+            if language in SHELLS and lines and not PICTURE.match(lines[0]):
+                yield from (Command(document, number, line) for line in lines)
+
+
 def commands() -> Iterator[tuple[Path, list[str], str]]:
     """Give each printed command: its document, the commands before it there, and itself."""
-    for path in documents():
-        before: list[str] = []
-        blocks = BLOCK.findall(path.read_text())
-        for block in (text for language, text in blocks if language in SHELLS):
-            lines = [line.strip() for line in block.replace('\\\n', ' ').splitlines()]
-            lines = [line for line in lines if line and not line.startswith('#')]
-            if not lines or PICTURE.match(lines[0]):
-                continue
-            for line in lines:
-                yield path, list(before), line
-                before.append(line)
+    before: dict[Path, list[str]] = {}
+    for document, _, line in printed():
+        earlier = before.setdefault(document, [])
+        yield document, list(earlier), line
+        earlier.append(line)
 
 
 def program(line: str) -> str:

@@ -13,7 +13,6 @@ Status 1 if a command did not end as the document lets one expect.
 """
 
 import argparse
-from collections.abc import Iterator
 import json
 import os
 from pathlib import Path
@@ -24,9 +23,8 @@ import signal
 import subprocess
 import sys
 import time
-from typing import NamedTuple
 
-from test_printed_commands import BLOCK, documents, PICTURE, ROOT, SHELLS
+from test_printed_commands import Command, printed, ROOT
 
 CONTROLLERS = (
     'lag_table_server',
@@ -79,23 +77,6 @@ PROFILE_EXISTS = 'test -e "${FASTRTPS_DEFAULT_PROFILES_FILE:-/}"'
 STARTING = 12.0  # s until what goes on in another terminal answers
 WATCHED = 5.0  # s that it is watched at least
 LIMIT = 3600.0  # s for a command
-
-
-class Command(NamedTuple):
-    """A printed command: where it stands, and the block in that document."""
-
-    document: Path
-    block: int
-    line: str
-
-
-def printed() -> Iterator[Command]:
-    for document in documents():
-        for number, (language, text) in enumerate(BLOCK.findall(document.read_text())):
-            lines = [line.strip() for line in text.replace('\\\n', ' ').splitlines()]
-            lines = [line for line in lines if line and not line.startswith('#')]
-            if language in SHELLS and lines and not PICTURE.match(lines[0]):
-                yield from (Command(document, number, line) for line in lines)
 
 
 def reason_not_here(line: str) -> str | None:
