@@ -61,12 +61,17 @@ def check_backend(backend: str | None, options: argparse.Namespace) -> None:
         raise ConfigurationError('--backend: --pace offline has no bridge')
     if backend in SIMULATED:
         return
-    if options.hardware is None:
+    check_hardware_is_named(options.hardware, backend)
+    if options.pace != 'realtime':
+        raise ConfigurationError(f'--backend {backend}: needs --pace realtime')
+
+
+def check_hardware_is_named(path: Path | None, backend: str) -> None:
+    """Raise ConfigurationError where ``backend`` has no hardware file, and there is no default."""
+    if path is None and backend not in SIMULATED:
         raise ConfigurationError(
             f'--backend {backend}: needs --hardware FILE, the calibration of this very rig'
         )
-    if options.pace != 'realtime':
-        raise ConfigurationError(f'--backend {backend}: needs --pace realtime')
 
 
 def hardware_of(
@@ -96,10 +101,7 @@ def rig_for(path: Path | None, configuration: Configuration, backend: str) -> Ha
 
     Raises ConfigurationError where it is no rig for ``backend`` or this bundle.
     """
-    if path is None and backend not in SIMULATED:
-        raise ConfigurationError(
-            f'--backend {backend}: needs --hardware FILE, the calibration of this very rig'
-        )
+    check_hardware_is_named(path, backend)
     path = path or simulated_hardware()
     hardware = load_hardware(path)
     check_rig(hardware, path, backend, len(configuration.fam.count))
